@@ -11,7 +11,7 @@ __all__ = ["RadianceModule", "SceneDataModule"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is heavy when it is asked for."""
+    """Import heavy modules on first use."""
     if name == "SceneDataModule":
         from xplanes.scenes.datamodule import SceneDataModule
 

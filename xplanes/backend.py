@@ -1,4 +1,4 @@
-"""Which implementation of the inner loops a tensor gets."""
+"""Chooses the implementation of the inner loops: numba, Triton or PyTorch."""
 
 import atexit
 import functools
@@ -31,10 +31,10 @@ COMPILING = 15
 
 @dataclass
 class WarmUp:
-    """The time that loops took to load and compile, which no stage of a run includes.
+    """Time spent loading and compiling the inner loops; the stages of a run exclude it.
 
     Attributes:
-        seconds: Since the process began.
+        seconds: Total in this process.
     """
 
     seconds: float = 0.0
@@ -67,7 +67,7 @@ def _found(package: str, consequence: str) -> bool:
         with warm_up.timed():
             importlib.import_module(package)
     except Exception as error:
-        # An installed package may still fail, if another is too new or too old for it.
+        # An installed package can fail to import next to an incompatible version of another.
         reason = str(error).strip().split("\n")[0]
         logger.warning("%s cannot be imported (%s): %s", package, reason, consequence)
         return False
@@ -79,7 +79,7 @@ def numba_found() -> bool:
     return _found(
         "numba",
         "the CPU takes the plain torch path, several times slower. "
-        "`pip install --upgrade numba` brings what is needed.",
+        "To install it: `pip install --upgrade numba`.",
     )
 
 
@@ -99,7 +99,7 @@ def triton_found() -> bool:
     return _found(
         "triton",
         "the GPU takes the plain torch path, which is slower. "
-        "`pip install --upgrade triton` brings it (torch for CUDA on Linux comes with it).",
+        "To install it: `pip install --upgrade triton` (PyTorch for CUDA on Linux includes it).",
     )
 
 
@@ -110,13 +110,13 @@ def _settle_triton() -> None:
     folder = os.environ.get("TRITON_CACHE_DIR") or f"{home}/.triton/cache"
     try:
         require_writable(Path(folder).expanduser())
-    except (OSError, RuntimeError):  # The latter where the user has no home.
+    except (OSError, RuntimeError):  # RuntimeError: the user has no home directory.
         own = tempfile.mkdtemp(prefix="xplanes_triton_")
         atexit.register(shutil.rmtree, own, ignore_errors=True)
         os.environ["TRITON_CACHE_DIR"] = own
         logger.warning(
-            "triton cannot write to %s: the GPU's kernels are compiled again at every start, which "
-            "takes some seconds each. TRITON_CACHE_DIR=FOLDER keeps them in FOLDER",
+            "triton cannot write to %s: each GPU kernel is compiled again at every start, which "
+            "takes some seconds. TRITON_CACHE_DIR=FOLDER keeps them in FOLDER",
             folder,
         )
 
@@ -135,13 +135,13 @@ def gpu_kernels(tensor: Tensor) -> bool:
 
 
 def waves(device: torch.device, *shape: int) -> Tensor:
-    """Numbers from -1 to 1 for a trial that leaves all random generators alone."""
+    """Test input from -1 to 1, made without any random generator."""
     count = torch.arange(torch.Size(shape).numel(), device=device, dtype=torch.float32)
     return count.mul(0.7).sin().view(shape)
 
 
 _refused: set[str] = set()
-"""Work whose Triton kernels failed their trial."""
+"""Operations whose Triton kernels failed their trial."""
 
 
 def proven(
@@ -152,17 +152,17 @@ def proven(
     plain: Callable[..., Any],
     dtype: torch.dtype,
 ) -> bool:
-    """Whether kernels compile, run and agree with their readable twin; logs if not.
+    """Whether kernels compile, run and agree with their reference implementation; logs if not.
 
-    Callers keep the answer: the trial compiles and waits for the device.
+    Callers cache the result: the trial compiles the kernels and waits for the device.
 
     Args:
-        what: Name of the work, for the message.
-        device: Where they are tried.
-        attempt: Runs one of them on a small input of some precision; returns values and gradients.
-        kernels: What is tried.
-        plain: Its twin.
-        dtype: Type of the planes; the twin computes in float32 at least.
+        what: Name of the operation, for the message.
+        device: Device of the trial.
+        attempt: Runs a function on a small input of a given type; returns values and gradients.
+        kernels: The kernels on trial.
+        plain: The reference implementation.
+        dtype: Type of the planes; the reference computes in float32 at least.
 
     Raises:
         DeviceError: If the device no longer responds.
@@ -177,12 +177,12 @@ def proven(
                     ours.to(exact), theirs, atol=tolerance, rtol=tolerance, check_dtype=False
                 )
     except Exception as error:
-        # No failure of a compiler ends the run: torch does the same.
+        # A compiler's failure must not end the run: PyTorch computes the same.
         reason = str(error).strip().split("\n")[0] or "no reason given"
         reason = f"{type(error).__name__}: {reason}"
         _require_alive(device, what, reason)
         logger.warning(
-            "the Triton kernels for %s are not used: %s. Plain torch does the same, slower; "
+            "the Triton kernels for %s are not used: %s. PyTorch computes the same, more slowly; "
             "XPLANES_GPU_KERNELS=0 hides this message.",
             *(what, reason),
         )
@@ -198,12 +198,12 @@ def _require_alive(device: torch.device, what: str, reason: str) -> None:
     except Exception as error:
         raise DeviceError(
             f"{device}: the GPU stopped answering in a trial of the Triton kernels for {what} "
-            f"({reason}). Start again with XPLANES_GPU_KERNELS=0, which leaves them out"
+            f"({reason}). Start again with XPLANES_GPU_KERNELS=0, which disables them"
         ) from error
 
 
 def memory_left(device: torch.device) -> float:
-    """Bytes that a GPU has left; no limit is known for other devices."""
+    """Free memory of a GPU in bytes; infinite for other devices."""
     return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else math.inf
 
 
@@ -217,25 +217,25 @@ def fast_bf16(device: torch.device) -> bool:
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit` that keeps what it compiles, wherever it finds a folder for that.
+    """`numba.njit` with its cache on disk, where numba finds a folder that it can write to.
 
     Args:
-        options: As for `numba.njit`; ``cache`` is settled here.
+        options: As for `numba.njit`; ``cache`` is set here.
     """
     numba = importlib.import_module("numba")
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:
             return numba.njit(cache=True, **options)(function)
-        except RuntimeError:  # A container may leave no folder that can be written.
-            _say_not_kept()
+        except RuntimeError:  # A container may have no writable folder.
+            _warn_not_cached()
             return numba.njit(**options)(function)
 
     return decorate
 
 
 @functools.cache
-def _say_not_kept() -> None:
+def _warn_not_cached() -> None:
     logger.warning(
         "numba finds no folder that it can write to: the inner loops are compiled again at every "
         "start, which takes about %d s. NUMBA_CACHE_DIR=FOLDER keeps them in FOLDER",
@@ -244,8 +244,8 @@ def _say_not_kept() -> None:
 
 
 def compiled(module: str) -> Any:
-    """A module of compiled loops; loading the first takes a second, compiling a few more, once."""
-    _settle_threads()
+    """A module of compiled loops. Loading the first takes a second; compiling, once, a few more."""
+    _start_threads()
     return importlib.import_module(module)
 
 
@@ -255,17 +255,17 @@ def gpu_module(module: str) -> Any:
 
 
 def synchronize(device: torch.device) -> None:
-    """Wait until a device has finished its work; the CPU always has."""
+    """Wait until a device has finished its work; returns at once for the CPU."""
     if device.type != "cpu":
         torch.get_device_module(device).synchronize(device)
 
 
 @functools.cache
-def _settle_threads() -> None:
-    """Start the loops' threads, as many as torch has, and leave torch's number as it is.
+def _start_threads() -> None:
+    """Start as many threads for the loops as PyTorch uses, without changing PyTorch's number.
 
-    If both use OpenMP, starting them sets torch's number to that of all cores, against the user's
-    choice, and sums would differ before and after the first loop.
+    If both use OpenMP, starting them sets PyTorch's number to all cores, against the user's choice;
+    sums would then differ before and after the first loop.
     """
     count = torch.get_num_threads()
     importlib.import_module("numba")
@@ -273,16 +273,16 @@ def _settle_threads() -> None:
 
 
 def use_threads(count: int) -> None:
-    """Let torch and the compiled loops, if they are loaded, share work among ``count`` threads."""
+    """Use ``count`` threads in PyTorch and, if they are loaded, in the compiled loops."""
     if numba := sys.modules.get("numba"):
         numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
-    if torch.get_num_threads() != count:  # Setting it, torch makes a pool of threads again.
+    if torch.get_num_threads() != count:  # Setting it recreates PyTorch's thread pool.
         torch.set_num_threads(count)
 
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """`use_threads` for the time of the block."""
+    """`use_threads` within the block."""
     before = torch.get_num_threads()
     use_threads(count)
     try:
@@ -292,7 +292,7 @@ def threads(count: int) -> Iterator[None]:
 
 
 def name(device: torch.device) -> str:
-    """Name of the inner loops on a device, with the kernels that failed their trial so far."""
+    """Name of the inner loops on a device, and the kernels that have failed their trial."""
     probe = torch.empty(0, device=device)
     if gpu_kernels(probe):
         failed = f" (torch for {', '.join(sorted(_refused))})" if _refused else ""

@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words[:1] == ["train"]:
         from xplanes.launch import train
 
-        # Hydra parses the command line of training itself.
+        # Hydra parses the command line of training.
         train(words[1:], words[:1] if sys.argv[1:] == words else ())
         return 0
     parser = build_parser(further_commands())
@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _unknown_command(parser: argparse.ArgumentParser, words: Sequence[str]) -> str:
-    """What a first word that is no command may have meant; empty for commands and options."""
+    """An error with suggestions if the first word is not a command or option; otherwise empty."""
     (known,) = (each.choices for each in parser._actions if each.dest == "COMMAND")
     assert known is not None
     if words[0] in known or words[0].startswith("-"):
@@ -81,7 +81,7 @@ def _unknown_command(parser: argparse.ArgumentParser, words: Sequence[str]) -> s
 
 
 def further_commands() -> list[AddCommands]:
-    """What installed packages add in the entry-point group ``xplanes.commands``."""
+    """Commands that installed packages register in the entry-point group ``xplanes.commands``."""
     from importlib.metadata import entry_points
 
     return [entry.load() for entry in sorted(entry_points(group="xplanes.commands"))]
@@ -111,7 +111,7 @@ def add_table(commands: "argparse._SubParsersAction", table: Mapping[str, Comman
 
 
 def option(text: str, usual: Any = None, /, **more: Any) -> dict[str, Any]:
-    """An option as `add_argument` takes it; a usual value gives its type and is in the help."""
+    """Arguments of `add_argument`; the default, if any, sets the type and is shown in the help."""
     if usual is None:
         return {"help": text, **more}
     text = f"{text}; default: %(default)s".removeprefix("; ")

@@ -1,4 +1,4 @@
-"""From nodes of a configuration to objects: the one place where classes are chosen by name."""
+"""Builds objects from nodes of a configuration: the only place where classes are named by text."""
 
 import importlib
 import re
@@ -36,14 +36,14 @@ MOVED = {
     "xplanes.rendering.proposal": "xplanes.baselines.proposal",
     "xplanes.scenes.demo.write": "xplanes.synthetic.demo.write",
 }
-"""Former modules, as runs and checkpoints of early 0.3 name them, and their present names."""
+"""Old names of modules in runs and checkpoints of early 0.3, and their present names."""
 
 _plugins: ContextVar[tuple[str, ...]] = ContextVar("plugins", default=())
 
 
 @contextmanager
 def plugins(modules: Sequence[str]) -> Iterator[None]:
-    """Let configurations name classes of the user's own modules, too.
+    """Allow configurations to name classes of the user's own modules, too.
 
     Args:
         modules: Names of modules or packages that the user asked for. They are imported.
@@ -58,7 +58,7 @@ def plugins(modules: Sequence[str]) -> Iterator[None]:
             importlib.import_module(name)
         except ImportError as error:
             raise ConfigError(
-                f"plugins: {name} cannot be imported ({error}): it must lie on Python's path "
+                f"plugins: {name} cannot be imported ({error}): it must be on Python's path "
                 "(PYTHONPATH=FOLDER)"
             ) from error
     token = _plugins.set((*_plugins.get(), *modules))
@@ -74,12 +74,12 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
     Args:
         node: Its class as ``_target_``, and its arguments. Settings without alternatives may leave
             ``_target_`` out.
-        kind: What the class must be derived from.
-        key: Where the node stands, for messages.
+        kind: Required base class.
+        key: Dotted name of the node, for messages.
         **more: Further arguments.
 
     Raises:
-        ConfigError: If the class is not one that may stand here, or refuses its arguments.
+        ConfigError: If the class is not allowed here, or refuses its arguments.
     """
     from hydra.errors import InstantiationException
     from hydra.utils import instantiate
@@ -99,7 +99,7 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
     arguments = {name: value for name, value in node.items() if name != "_target_"}
     try:
         if issubclass(cls, Settings):
-            # What `instantiate` would do takes longer.
+            # Faster than `instantiate`, with the same result.
             return cast(T, read_settings(cls, {**arguments, **more}))
         for name, value in arguments.items():
             if isinstance(value, Mapping) and "_target_" in value:
@@ -109,7 +109,7 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
                 )
         if cls.__module__.startswith("xplanes."):
             check_arguments(cls.__init__, arguments)
-        # Arguments may be called as those of `instantiate` are, such as config.
+        # Passed as a dict: an argument may share a name with one of `instantiate`, such as config.
         whole = {**arguments, "_target_": cls, "_recursive_": False, "_convert_": "all"}
         return instantiate(whole, **more)
     except ConfigError as error:
@@ -127,7 +127,7 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
 
 
 def read_settings(cls: type[S], values: Mapping[str, Any]) -> S:
-    """Settings of plain values, those nested in them included.
+    """Settings, and those nested in them, from builtins.
 
     Raises:
         ConfigError: For a name that does not exist or is missing, or a value out of range.
@@ -138,7 +138,7 @@ def read_settings(cls: type[S], values: Mapping[str, Any]) -> S:
 
 
 def _nested(key: str, value: Any, hint: Any) -> Any:
-    """A plain value with the settings that its type asks for built."""
+    """A value, converted to nested settings where its type asks for them."""
     kinds, _ = kinds_of(hint)
     if isinstance(value, Mapping):
         for kind in kinds:
@@ -151,15 +151,15 @@ def _nested(key: str, value: Any, hint: Any) -> Any:
 
 
 def class_of(target: Any, kind: type, key: str) -> type:
-    """The class of a dotted name, if it may stand in its place.
+    """The class of a dotted name, if it is allowed in that place.
 
     Args:
         target: The name, as module.Class.
-        kind: The class that it must derive from.
-        key: Where the name stands, for messages.
+        kind: Required base class.
+        key: Dotted name of the setting, for messages.
 
     Raises:
-        ConfigError: If there is no such class, or it may not stand there.
+        ConfigError: If there is no such class, or it is not allowed there.
     """
     name = str(target)
     allowed = (*TRUSTED, *_plugins.get())
@@ -178,7 +178,7 @@ def class_of(target: Any, kind: type, key: str) -> type:
         raise ConfigError(
             f"{key}={name}: must be a class derived from {kind.__module__}.{kind.__qualname__}"
         )
-    # A trusted module also holds names that it only imported.
+    # A trusted module also contains names that it has only imported.
     if not any(f"{found.__module__}.".startswith(f"{root}.") for root in allowed):
         raise ConfigError(
             f"{key}={name}: it is defined in {found.__module__}, which is not allowed"

@@ -1,4 +1,4 @@
-"""The configuration files and what Hydra makes of them. Must stay quick: it imports no torch."""
+"""The configuration files, composed by Hydra. Must import fast, hence without torch."""
 
 import difflib
 import re
@@ -34,25 +34,25 @@ ELSEWHERE = {
     "world_time": "model.loss.time_factor_with_background={}",
     "world_threshold": "model.sampler.threshold_with_background={}",
 }
-"""Settings by their names in other programs or earlier versions, with a place for their value."""
+"""Settings by their names in other programs or earlier versions; {} stands for the value."""
 
 _PLAIN = re.compile(r"(?!\.\d)[A-Za-z_./][A-Za-z0-9_./-]*")
-"""Text that Hydra reads as it is; other letters it takes in quotes alone."""
+"""Text that Hydra reads verbatim; all other text needs quotes."""
 
 _WORDS = ("null", "none", "true", "false", "inf", "nan")
-"""Text that means something else without quotes."""
+"""Words that Hydra does not read as text unless they are quoted."""
 
 
 def compose_plain(name: str | None, overrides: Sequence[str], conf: Path = CONF) -> dict[str, Any]:
     """A configuration with some settings changed, resolved to builtins.
 
     Args:
-        name: Its file in ``conf``, without ending; None for nothing but what ``overrides`` add.
+        name: Its file in ``conf``, without suffix; None for an empty configuration.
         overrides: ``key=value`` each.
         conf: The configuration folder.
 
     Raises:
-        ConfigError: For a key or option that does not exist, or an override that is no text.
+        ConfigError: For a key or option that does not exist, or an override that is not a string.
     """
     from hydra import compose
 
@@ -69,7 +69,7 @@ def compose_plain(name: str | None, overrides: Sequence[str], conf: Path = CONF)
 def group_options(
     group: str, overrides: Sequence[str] = (), name: str = "train", conf: Path = CONF
 ) -> list[str]:
-    """Names of a group's options, those of the folders in ``hydra.searchpath`` included.
+    """Names of a group's options, including those from ``hydra.searchpath``.
 
     Args:
         group: The group, such as ``data``.
@@ -89,7 +89,7 @@ def group_options(
 
 @contextmanager
 def _hydra(conf: Path, name: str | None, overrides: Sequence[str]) -> Iterator[None]:
-    """A Hydra of our own, whose errors say what is nearest to an unknown name."""
+    """A separate Hydra whose errors suggest names close to an unknown one."""
     from hydra.errors import HydraException
 
     try:
@@ -107,8 +107,8 @@ def _initialized(conf: Path) -> Iterator[None]:
     from hydra.core.plugins import Plugins
     from hydra.core.singleton import Singleton
 
-    Plugins.instance()  # What they register belongs to the state that comes back.
-    # Inside a job there is a Hydra already, which must be there again afterwards.
+    Plugins.instance()  # Before the state is saved, as plug-ins register themselves in it.
+    # Inside a job Hydra is already initialised; its state is restored afterwards.
     outer = Singleton.get_state()
     GlobalHydra.instance().clear()
     try:
@@ -133,28 +133,28 @@ def to_plain(config: Any) -> dict[str, Any]:
 
 
 def key_and_value(override: str) -> tuple[str, str]:
-    """Key and value of an override; an empty key for anything else."""
+    """Key and value of an override; the key is empty for anything else."""
     key, equals, value = override.partition("=")
     return (key.lstrip("+~"), value) if equals and not key.startswith("-") else ("", "")
 
 
 def settings_and_paths(arguments: Sequence[str]) -> tuple[list[str], list[Path]]:
-    """Words of a command line that are settings, and those that are files or folders."""
+    """Splits the words of a command line into settings, and files or folders."""
     changed = [text for text in arguments if "=" in text and not Path(text).exists()]
     return changed, [Path(text) for text in arguments if text not in changed]
 
 
 def quoted(text: str) -> str:
-    """Text as Hydra reads it in an override."""
+    """Text in quotes and escapes, so that Hydra reads it unchanged in an override."""
     if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
         return text
-    # Backslashes count only before a quote, and the closing one is a quote, too.
+    # Backslashes need escaping only before a quote, the closing one included.
     escaped = re.sub(r"(\\+)$", r"\1\1", re.sub(r"(\\*)'", r"\1\1\'", text))
     return f"'{escaped}'"
 
 
 def unquoted(text: str) -> str:
-    """The value of an override as text: what `quoted` was given, if it was quoted."""
+    """The value of an override as text: the inverse of `quoted`."""
     if text[:1] not in ("'", '"'):
         return text
     from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -163,12 +163,12 @@ def unquoted(text: str) -> str:
 
 
 def with_names(override: str, *, several: bool = False) -> str:
-    """An override whose name or path Hydra reads as it stands, with ``~`` as the user's folder.
+    """An override with its name or path quoted for Hydra and ``~`` expanded.
 
-    Hydra would make a number of 2024_05_01, and refuse accents, spaces and brackets.
+    Unquoted, Hydra would read 2024_05_01 as a number, and reject accents, spaces and brackets.
 
     Args:
-        override: ``key=value``, or anything else, which stays as it is.
+        override: ``key=value``; anything else is returned unchanged.
         several: Whether a comma separates values, as in a multirun.
     """
     key, equals, value = override.partition("=")
@@ -180,13 +180,13 @@ def with_names(override: str, *, several: bool = False) -> str:
     if "(" in value and re.fullmatch(r"(choice|range|interval|glob|sort|shuffle)\(.*\)", value):
         return override
     if "," in value and not several and key.lstrip("+~") == "data.scene":
-        return override  # Hydra says that a list of scenes needs --multirun.
+        return override  # Hydra's own error says that a list of scenes needs --multirun.
     parts = value.split(",") if several else [value]
     return f"{key}={','.join(quoted(at_home(part)) for part in parts)}"
 
 
 def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "train") -> str:
-    """What the first override of an unknown option or key may have meant; or nothing.
+    """Suggestions for the first override with an unknown option or key; empty if there is none.
 
     Args:
         overrides: ``key=value`` each.
@@ -240,7 +240,7 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
     if key is None:
         return ""
     if options := _options_with(key, groups, conf):
-        return f"{key} belongs to {' and '.join(options)}, not to what is chosen"
+        return f"{key} belongs to {' and '.join(options)}, which is not chosen"
     prefix, _, last = key.rpartition(".")
     if last in ELSEWHERE:
         return f"Did you mean {ELSEWHERE[last].format(keys[key])}?"
@@ -255,7 +255,7 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
 
 
 def _described(conf: Path, group: str, word: str) -> list[str]:
-    """Options whose files begin with a comment that begins with a word, and its first words."""
+    """Options whose first comment begins with ``word``, and the beginning of that comment."""
     found = []
     for path in sorted((conf / group).glob("*.yaml")):
         words = re.match("# ([^.,:]+)", path.read_text(encoding="utf-8"))

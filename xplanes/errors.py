@@ -21,7 +21,7 @@ class DeviceError(XPlanesError, RuntimeError):
 
 
 class LRMError(XPlanesError, ValueError):
-    """A model, its weights or its input cannot be used; the message says why and what to do."""
+    """An LRM, its weights or its input cannot be used; the message says why and what to do."""
 
 
 class SceneError(XPlanesError, ValueError):
@@ -29,11 +29,11 @@ class SceneError(XPlanesError, ValueError):
 
 
 class MissingSplitError(SceneError):
-    """A scene has no split of a name."""
+    """A scene lacks a split."""
 
 
 class BrokenFrameError(SceneError):
-    """One frame cannot be used; a capture can do without it."""
+    """A frame is unusable, but the rest of the capture can be used."""
 
 
 def require_between(name: str, value: float | None, low: float, high: float) -> None:
@@ -47,14 +47,14 @@ def require_between(name: str, value: float | None, low: float, high: float) -> 
 
 
 SHOWN = 5
-"""Problems of a capture that are shown in full."""
+"""Number of problems of a capture that are shown in full."""
 
 
 def refuse_all(problems: Sequence[str]) -> None:
-    """Refuse a capture with all of its problems at once, if there are any.
+    """Report all problems of a capture in one error, if there are any.
 
     Raises:
-        SceneError: With the first of many problems, and their number.
+        SceneError: With the first problems, and their number.
     """
     if problems:
         raise SceneError(first_of(problems))
@@ -64,7 +64,7 @@ def all_of(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Re
     """The results of a function for all items.
 
     Raises:
-        SceneError: If it refuses some; with the problems of all, see `refuse_all`.
+        SceneError: If it fails for some items; with all of their problems, see `refuse_all`.
     """
     results: list[Result] = []
     problems: list[str] = []
@@ -78,7 +78,7 @@ def all_of(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Re
 
 
 def first_of(problems: Sequence[str]) -> str:
-    """The first of many problems, a line each, and how many more there are."""
+    """The first problems, one per line, and how many more there are."""
     more = len(problems) - SHOWN
     rest = [f"... and {more} more problems like these."] * (more > 0)
     return "\n".join([*problems[:SHOWN], *rest])

@@ -21,7 +21,7 @@ OWNERS = {
     "logger": "logger=none, or another of its group,",
     "default_root_dir": "hydra.run.dir",
 }
-"""Arguments of the Trainer that are not set directly, and what to set instead."""
+"""Arguments of the Trainer that cannot be set directly, and what to set instead."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Experiment:
 
     Attributes:
         config: The configuration that they come from.
-        method: How the field is made and trained.
+        method: Model, initialisation and losses.
         data: The scene.
         trainer: Arguments of the Trainer.
         callbacks: Callbacks by name.
@@ -52,8 +52,8 @@ class Experiment:
 
         Args:
             config: The resolved configuration, builtins only.
-            modules: Modules of the user's own whose classes it may name; those that the
-                configuration names when None. Files from others must not choose them.
+            modules: The user's own modules whose classes it may name; None allows those that the
+                configuration lists, which is unsafe for files from others.
 
         Raises:
             ConfigError: If settings are missing, out of range, or contradict one another.
@@ -132,8 +132,8 @@ def _nodes(content: Any) -> dict[str, Mapping[str, Any]]:
 def _logger(name: str, node: Mapping[str, Any], run: Path) -> Logger:
     """The logger of a node.
 
-    TensorBoard's hands arguments that it does not know to its writer, which refuses them only when
-    the first curve is written.
+    TensorBoardLogger passes unknown arguments on to its writer, which rejects them only when the
+    first curve is written. They are rejected here instead.
 
     Raises:
         ConfigError: If it refuses its arguments.

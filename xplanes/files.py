@@ -17,10 +17,10 @@ from typing import Any
 from xplanes.errors import ConfigError, XPlanesError
 
 MARK = ".tmp-"
-"""Part of the name of every file that is not whole yet."""
+"""Part of the name of every file that is still being written."""
 
 DAY = 86_400.0
-"""Seconds of a day, the age from which an unfinished file in a cache counts as abandoned."""
+"""Age in seconds (one day) after which an unfinished file in a cache counts as abandoned."""
 
 
 class StorageError(XPlanesError, OSError):
@@ -28,11 +28,11 @@ class StorageError(XPlanesError, OSError):
 
 
 def storage_error(problem: OSError, path: Path | None = None) -> StorageError | None:
-    """The error to report for a problem of the disk; None for any other problem.
+    """The error to report for a disk problem; None for any other problem.
 
     Args:
-        problem: What went wrong.
-        path: The file to be written; when None, that of the problem, which may have been read.
+        problem: The original error.
+        path: The file to be written; when None, the one that ``problem`` names.
     """
     way_out = _WAYS_OUT.get(problem.errno or 0)
     if way_out is None or (path is None and problem.errno not in _ONLY_WRITING):
@@ -48,7 +48,7 @@ def storage_error(problem: OSError, path: Path | None = None) -> StorageError | 
     return StorageError(f"{place} cannot be written: {reason}{room}. {way_out}")
 
 
-_FREE = "Free some space, or choose a folder on another disk; what was there before is still whole"
+_FREE = "Free some space, or choose a folder on another disk; existing files are intact"
 _OPEN = "Choose a folder that can be written"
 _IN_THE_WAY = "A file stands where a folder should be: choose another folder"
 _WAYS_OUT = {
@@ -64,11 +64,11 @@ _WAYS_OUT = {
 }
 
 _ONLY_WRITING = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
-"""Problems that reading cannot have."""
+"""Errors that only writing can raise."""
 
 
 def natural(name: str) -> list[str | int]:
-    """A name as text and numbers in turns, so that frame_10 is sorted after frame_9."""
+    """A sort key of alternating text and numbers: frame_10 comes after frame_9."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
@@ -86,7 +86,7 @@ def is_there(path: Path) -> bool:
 
 
 def stand_in(path: Path) -> str | None:
-    """Why a file is only a placeholder of the real one, and what to do; None for other files.
+    """If a file is only a placeholder for the real one, why, and what to do; otherwise None.
 
     Args:
         path: A file that cannot be read.
@@ -110,7 +110,7 @@ def stand_in(path: Path) -> str | None:
 
 
 def require_writable(folder: Path) -> None:
-    """Refuse a folder, which need not exist yet, that cannot take a small file.
+    """Refuse a folder in which no file can be written; it need not exist yet.
 
     Raises:
         StorageError: If it cannot.
@@ -128,7 +128,7 @@ def require_writable(folder: Path) -> None:
 
 
 def require_empty(folder: Path) -> None:
-    """Refuse a folder, which need not exist yet, that holds files or is one.
+    """Refuse a path that is a file or a folder with files; it need not exist yet.
 
     Raises:
         ConfigError: If it does.
@@ -141,7 +141,7 @@ def require_empty(folder: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` that takes its name when the block ends well.
+    """A temporary path beside ``path``, renamed to it when the block succeeds.
 
     Raises:
         StorageError: If the disk is full, cannot be written, or fails.
@@ -154,7 +154,7 @@ def replacing(path: Path) -> Iterator[Path]:
         os.close(handle)
         temporary = Path(name)
         yield temporary
-        with temporary.open("r+b") as file:  # Windows syncs only what is open for writing.
+        with temporary.open("r+b") as file:  # Windows syncs only files open for writing.
             os.fsync(file.fileno())
         temporary.chmod(0o644)
         temporary.replace(path)
@@ -168,10 +168,10 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def clear_unfinished(folder: Path, older_than: float = 0.0) -> None:
-    """Remove what writers that were killed left half-written below a folder.
+    """Remove half-written files that killed processes left below a folder.
 
     Args:
-        folder: Where to look, in all folders below it too.
+        folder: Searched recursively.
         older_than: Age in seconds below which a file may still be in use.
     """
     for path in folder.rglob(f".*{MARK}*"):
@@ -179,17 +179,17 @@ def clear_unfinished(folder: Path, older_than: float = 0.0) -> None:
             if path.is_file() and time.time() - path.stat().st_mtime >= older_than:
                 path.unlink()
         except OSError:
-            continue  # Another process was first, or the folder cannot be written.
+            continue  # Another process has removed it, or the folder is read-only.
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
+    """Write a text file atomically."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON whole or not at all; numbers that are not finite become null."""
+    """Write JSON atomically; numbers that are not finite become null."""
     write_text(path, json.dumps(_finite(content), indent=2) + "\n")
 
 
@@ -217,7 +217,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_rows(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
-    """Write a CSV file whole or not at all."""
+    """Write a CSV file atomically."""
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
@@ -225,7 +225,7 @@ def write_rows(path: Path, header: Iterable[str], rows: Iterable[Iterable[Any]])
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV file by column name; none where there is no file."""
+    """Rows of a CSV file by column name; empty if there is no file."""
     if not path.is_file():
         return []
     with path.open(newline="", encoding="utf-8") as file:

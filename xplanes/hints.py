@@ -1,4 +1,4 @@
-"""Command lines that Hydra answers with a dump or a traceback. Must stay quick: no torch."""
+"""Clear errors for command lines that Hydra answers with a traceback. Must import without torch."""
 
 import re
 import shlex
@@ -9,10 +9,10 @@ from xplanes.errors import ConfigError
 
 
 def require_readable(arguments: Sequence[str]) -> None:
-    """Refuse what is not ``key=value`` or an option of Hydra.
+    """Refuse arguments that are neither ``key=value`` nor an option of Hydra.
 
     Raises:
-        ConfigError: With the arguments as they were probably meant.
+        ConfigError: With the arguments that were probably meant.
     """
     from hydra._internal.utils import get_args_parser
 
@@ -34,7 +34,7 @@ def require_readable(arguments: Sequence[str]) -> None:
 
 
 def _require_pairs(words: Sequence[str]) -> None:
-    """Refuse words that are no override, such as one that a shell has split at a space."""
+    """Refuse words that are not overrides, such as a value that the shell split at a space."""
     for number, word in enumerate(words):
         if "=" in word or word.startswith("~"):
             continue
@@ -55,7 +55,7 @@ def _is_key(word: str) -> bool:
 
 
 def _in_shell(text: str) -> str:
-    """A word as it is typed in a shell: between double quotes, as the manual has them."""
+    """A word as it is typed in a shell: in double quotes, as in the manual, where possible."""
     plain = shlex.quote(text) == text or set(text) & set('"$`\\!')
     return shlex.quote(text) if plain else f'"{text}"'
 

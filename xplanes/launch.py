@@ -1,6 +1,6 @@
 """Training from the command line: resumed runs, sweeps, and the job that Hydra runs.
 
-Must stay quick: it imports neither torch nor lightning before the job begins.
+For a fast start, neither torch nor lightning is imported before the job begins.
 """
 
 import re
@@ -44,18 +44,18 @@ FORMER = {
     "table3": "sweep=tables2_3",
     "views": "lrm=none,tiny data.views=5,10,20,null",
 }
-"""Former experiments and sweeps, and the command that replaces each of them."""
+"""Old names of experiments and sweeps, each with the overrides that replace it."""
 
 
 def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
-    """Run one job of training, or a multirun.
+    """Run one training job, or a multirun.
 
     Args:
         arguments: Overrides and options of Hydra.
-        words: What stands before them on the command line, after the program.
+        words: Words between the program and these arguments on the command line.
 
     Raises:
-        SystemExit: With a message after an error that was explained, or 130 after Ctrl-C.
+        SystemExit: With a message after a known error, or 130 after Ctrl-C.
     """
     try:
         prepared = prepare(list(arguments))
@@ -74,7 +74,7 @@ def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
     try:
         hydra.main(config_path=str(CONF), config_name="train", version_base="1.3")(job)()
     except SystemExit as end:
-        if isinstance(end.code, int) and end.code and not begun:  # A text is our own message.
+        if isinstance(end.code, int) and end.code and not begun:  # A str is our own message.
             chosen = [text for text in prepared if key_and_value(text)[0]]
             if near := near_names(chosen):
                 print(near, file=sys.stderr)
@@ -82,13 +82,13 @@ def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
 
 
 _prepared: dict[str, Any] = {}
-"""What the check has parsed and built, for the job that follows, by its folder."""
+"""Jobs that the check has prepared, by run directory, so that they are not prepared twice."""
 
 
 class SettingsCheck(Callback):
-    """Refuses settings before Hydra makes the run directory; jobs of a sweep check their own.
+    """Refuses invalid settings before Hydra makes the run directory; jobs of a sweep do so later.
 
-    Hydra makes warnings of exceptions in callbacks, hence the exits.
+    Hydra turns exceptions in callbacks into warnings, hence ``sys.exit``.
     """
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -102,7 +102,7 @@ class SettingsCheck(Callback):
         HydraConfig.instance().set_config(config)  # As Hydra does for the job, for ${hydra:...}.
         try:
             if (plain := _resolved(OmegaConf.masked_copy(config, names))) is not None:
-                # Settings may lack what the run's own name consists of.
+                # Fails here if a setting that names the run directory is missing.
                 _prepared[config.hydra.run.dir] = prepare(
                     plain, Path(config.hydra.run.dir).absolute()
                 )
@@ -121,7 +121,7 @@ class SettingsCheck(Callback):
 
 
 def _resolved(config: DictConfig) -> dict[str, Any] | None:
-    """Settings without references; None where one is to what Hydra knows in the job alone."""
+    """Settings with interpolations resolved; None if one needs values known only in the job."""
     try:
         return to_plain(config)
     except ConfigError:
@@ -131,7 +131,7 @@ def _resolved(config: DictConfig) -> dict[str, Any] | None:
 
 
 def _job(config: DictConfig) -> float:
-    """Run one job; the score goes to sweepers."""
+    """Run one job and return its score, which optimising sweepers use."""
     from xplanes.run import KNOWN_ERRORS, run
 
     settings = HydraConfig.get()
@@ -148,7 +148,7 @@ def _job(config: DictConfig) -> float:
         resume = auto or plain["resume"] not in (None, "auto")
         if auto:
             _require_same_job(folder, settings.overrides.task)
-        # A run that goes on must find the user's own groups again.
+        # A resumed run needs the user's own configuration groups, too.
         own = [text for text in settings.overrides.hydra if key_and_value(text)[0] == SEARCHPATH]
         task = [text for text in settings.overrides.task if key_and_value(text)[0] != "resume"]
         job = None if sweep else _prepared.pop(settings.run.dir, None)
@@ -166,7 +166,7 @@ def _job(config: DictConfig) -> float:
 
 
 def _require_same_job(folder: Path, overrides: Iterable[str]) -> None:
-    """Refuse to take another job's run for the one that a sweep would go on with.
+    """Refuse to resume a sweep's job in a folder that holds the run of another job.
 
     Raises:
         ConfigError: With the settings of that run.
@@ -174,25 +174,25 @@ def _require_same_job(folder: Path, overrides: Iterable[str]) -> None:
     try:
         kept = (folder / "overrides.txt").read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
-        return  # Damaged: it is written again.
+        return  # Damaged: it will be overwritten.
     before, now = ({t for t in each if not _may_differ(t)} for each in (kept, overrides))
     if before != now:
         raise ConfigError(
             f"{folder} holds the run with {' '.join(sorted(before)) or 'no settings'}, not that "
-            f"with {' '.join(sorted(now)) or 'none'}: give the sweep that it belongs to, or take "
+            f"with {' '.join(sorted(now)) or 'none'}: repeat the command of its sweep, or choose "
             "another hydra.sweep.dir"
         )
 
 
 def _may_differ(override: str) -> bool:
-    """Whether a run may go on with this changed: how long it trains, what it writes, and where."""
+    """Whether a resumed run may change this setting: its budget, what it writes, and where."""
     return not override or key_and_value(override)[0].split(".")[0] in (
         *("resume", "hydra", "trainer", "callbacks", "logger", "media", "viewer"),
     )
 
 
 def prepare(arguments: list[str]) -> list[str]:
-    """Turn ``resume=RUN`` into the overrides of the run that continues, and try its folder.
+    """Replace ``resume=RUN`` by that run's overrides, and check that its folder is writable.
 
     Args:
         arguments: Overrides and options of Hydra.
@@ -209,7 +209,7 @@ def prepare(arguments: list[str]) -> list[str]:
     _require_present_names(arguments, several=several)
     arguments = [with_names(text, several=several) for text in arguments]
     require_parsed([text for text in arguments if key_and_value(text)[0]])
-    # Lightning hands names on in quotes to the other processes of a run.
+    # Lightning passes names in quotes to the other processes of a run.
     values = {key: unquoted(value) for key, value in map(key_and_value, arguments) if key}
     for key, value in values.items():
         if value in ("null", "None") and (CONF / key).is_dir():
@@ -217,7 +217,7 @@ def prepare(arguments: list[str]) -> list[str]:
             raise ConfigError(f"{key}={value}: must be one of {known}")
     resume, folder = values.get("resume", "null"), values.get("hydra.run.dir")
     if resume in ("null", "", "None", "auto"):
-        # Before Hydra makes the folder, whose errors are tracebacks.
+        # Checked before Hydra makes the folder, because it would fail with a traceback.
         place = values.get("hydra.sweep.dir") if several else folder
         require_writable(Path(place or "outputs"))
         if resume != "auto" or several:
@@ -252,7 +252,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     text = path.read_text(encoding="utf-8")
     if text and not text.endswith("\n"):
         raise ConfigError(
-            f"{path} is damaged: its last line is cut short. Mend it from {run / 'config.yaml'}, "
+            f"{path} is damaged: its last line is cut off. Mend it from {run / 'config.yaml'}, "
             "one key=value a line"
         )
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
@@ -269,7 +269,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
 
 
 def _require_present_names(arguments: Sequence[str], *, several: bool) -> None:
-    """Answer choices that there were with those of today.
+    """Refuse options of earlier versions, and name those that replace them.
 
     Raises:
         ConfigError: With the commands.
@@ -299,7 +299,7 @@ def _require_present_names(arguments: Sequence[str], *, several: bool) -> None:
 
 
 def _entries(names: str) -> list[str]:
-    """What the group ``entry`` chose: models, together where the rest is the same."""
+    """Overrides that replace options of the former group ``entry``; equal ones share a command."""
     found: dict[str, list[str]] = {}
     for name in names.split(","):
         if name.startswith("ablation_"):
@@ -315,7 +315,7 @@ def _entries(names: str) -> list[str]:
 
 
 def _require_version(run: Path) -> None:
-    """Refuse a run of a version whose settings were others."""
+    """Refuse a run of a version with different settings."""
     try:
         version = str(read_json(run / "run.json").get("xplanes", __version__))
     except (OSError, ValueError):
@@ -343,7 +343,7 @@ def _latest(outputs: Path, overrides: list[str]) -> Path | None:
 
 
 def _without_resume(overrides: Iterable[str]) -> list[str]:
-    """Overrides in order, but for what the command line alone says of the run that it continues."""
+    """Overrides without those that only say which run to resume."""
     keys = {text: key_and_value(text)[0] for text in overrides if text}
     left_out = {"resume", *(key for key in keys.values() if key.startswith("hydra."))}
     return sorted(t for t, key in keys.items() if key == SEARCHPATH or key not in left_out)
@@ -355,6 +355,6 @@ def _newest(outputs: Path, name: str) -> list[Path]:
 
 
 def _is_multirun(arguments: list[str]) -> bool:
-    """Whether Hydra will run several jobs, by an option or by its mode."""
+    """Whether Hydra will run several jobs, because of an option or its mode."""
     mode = dict(map(key_and_value, arguments)).get("hydra.mode")
     return mode == "MULTIRUN" or not {"-m", "--multirun"}.isdisjoint(arguments)

@@ -1,4 +1,4 @@
-"""Locks between processes; the system frees a lock however its process ends."""
+"""Locks between processes; the system releases a lock even if its process is killed."""
 
 import logging
 from collections.abc import Iterator
@@ -13,15 +13,15 @@ from xplanes.files import read_json
 logger = logging.getLogger(__name__)
 
 RUN_LOCK = ".lock"
-"""File in a run directory that its process holds."""
+"""File in a run directory that the running process locks."""
 
 
 @contextmanager
 def in_turn(path: Path | None) -> Iterator[bool]:
-    """Hold a lock, once no other process holds it.
+    """Wait for a lock, and hold it within the block.
 
     Args:
-        path: The lock's file; None holds nothing.
+        path: The lock's file; None: no lock.
 
     Returns:
         Whether this process had to wait.
@@ -41,7 +41,7 @@ def in_turn(path: Path | None) -> Iterator[bool]:
 
 @contextmanager
 def if_free(path: Path) -> Iterator[bool]:
-    """Hold a lock, unless another process holds it.
+    """Hold a lock within the block, unless another process holds it.
 
     Returns:
         Whether this process holds it.
@@ -57,7 +57,7 @@ def if_free(path: Path) -> Iterator[bool]:
 
 @contextmanager
 def alone_in(run: Path) -> Iterator[None]:
-    """Hold a run directory, so that no second process writes into it.
+    """Lock a run directory, so that no second process writes into it.
 
     Raises:
         ConfigError: If another process holds it.

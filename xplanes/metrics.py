@@ -1,7 +1,7 @@
 """Image quality, one number per view.
 
-Scores of several views are means of the views' scores, as in the literature; pooling the errors
-first gives different numbers.
+Scores of several views are means of per-view scores, as in the literature. Pooling the errors of
+all views first would give different numbers.
 """
 
 import torch
@@ -12,8 +12,8 @@ def psnr(prediction: Tensor, truth: Tensor, shown: Tensor | None = None) -> floa
     """Peak signal-to-noise ratio in dB of one image in [0, 1], at most 100.
 
     Args:
-        prediction: The image. [H, W, 3]
-        truth: What it should be. [H, W, 3]
+        prediction: Rendered image. [H, W, 3]
+        truth: True image. [H, W, 3]
         shown: Pixels that count; all when None. bool [H, W]
     """
     squares = (prediction.clamp(0, 1).double() - truth.double()).square()
@@ -27,8 +27,8 @@ def ssim(prediction: Tensor, truth: Tensor, shown: Tensor | None = None) -> floa
     Images below 11 pixels a side have no window to slide and score NaN.
 
     Args:
-        prediction: The image. [H, W, 3]
-        truth: What it should be. [H, W, 3]
+        prediction: Rendered image. [H, W, 3]
+        truth: True image. [H, W, 3]
         shown: Pixels that count; all when None. bool [H, W]
     """
     if min(truth.shape[:2]) < 11:

@@ -1,4 +1,4 @@
-"""Packages that only optional extras need."""
+"""Packages that only optional extras install."""
 
 import importlib
 from types import ModuleType
@@ -11,7 +11,7 @@ class MissingExtraError(XPlanesError, ImportError):
 
 
 def require(module: str, *, extra: str) -> ModuleType:
-    """Import ``module``, or say which extra brings it.
+    """Import ``module``, or say which extra installs it.
 
     Raises:
         MissingExtraError: If it is not installed; the message names the extra.

@@ -1,6 +1,6 @@
-"""This process: its start, OpenMP's threads, what oneDNN keeps, the user's home, its command line.
+"""This process: start time, OpenMP threads, oneDNN's cache, home directory, command line.
 
-Must stay quick: its caller has yet to import torch, whose libraries read the environment once.
+Must not import torch: its libraries read the environment, which is set here, once.
 """
 
 import ctypes
@@ -13,29 +13,29 @@ from contextlib import suppress
 from pathlib import Path
 
 STARTED = time.perf_counter()
-"""When this process began, as `time.perf_counter` counts."""
+"""Time at which this process started, on the clock of `time.perf_counter`."""
 
 WAIT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "10000"}
-"""Threads spin briefly, then sleep: spinning for long wastes the cores of a shared machine."""
+"""Idle threads spin briefly, then sleep: long spinning wastes the cores of a shared machine."""
 
 
 KEEP = {"ONEDNN_PRIMITIVE_CACHE_CAPACITY": "256"}
-"""Number of compiled matrix products that oneDNN keeps; each takes 0.4 MB and fragments the heap.
+"""Number of matrix-product kernels that oneDNN caches; each takes 0.4 MB and fragments the heap.
 
-Each number of samples needs its own. With oneDNN's default of 1024 a process grows by 150 MB at
-each evaluation of eleven 400 px images; 64 are enough for full speed.
+Each number of samples needs its own kernel. With oneDNN's default of 1024, each evaluation of
+eleven 400 px images adds 150 MB to the process; 64 are enough for full speed.
 """
 
 
 NOWHERE = {"HOME": os.devnull}
-"""A home directory for users without one, as in containers; nothing can be written there.
+"""Home directory for users without one, as in containers; it is not writable.
 
 Without it some libraries fail, and others write into a folder called ``~``.
 """
 
 
 def defaults(environment: Mapping[str, str]) -> dict[str, str]:
-    """The variables to add; `WAIT` only if neither of its two is set, as they work together."""
+    """Environment variables to add; those in `WAIT` work together, and are added if none is set."""
     try:
         Path.home()
         groups = [WAIT, KEEP]
@@ -50,14 +50,14 @@ def defaults(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 MMAP_THRESHOLD, TRIM_THRESHOLD = (-3, 2**30), (-1, 2**31 - 1)
-"""Options of glibc's ``mallopt``: sizes from which blocks, and free memory, are given back."""
+"""Options of glibc's ``mallopt``: sizes above which blocks, and free memory, are released."""
 
 
 def keep_freed_memory() -> None:
-    """Let glibc reuse what is freed instead of giving it back to the system.
+    """Let glibc reuse freed memory instead of returning it to the system.
 
-    Fresh pages for the temporaries of each step cost a tenth of its time with large batches. Other
-    C libraries, and whoever sets one of glibc's own variables, are left alone.
+    With large batches, new pages for temporaries take a tenth of each step's time. Nothing changes
+    with other C libraries, or if the user has set one of glibc's own variables.
     """
     if any(name.startswith("MALLOC_") or name == "GLIBC_TUNABLES" for name in os.environ):
         return
@@ -68,10 +68,10 @@ def keep_freed_memory() -> None:
 
 
 def train_command() -> str:
-    """The command that trains, as this process was started: for messages that name it."""
+    """The training command in the form in which this process was started, for messages."""
     return "python train.py" if Path(sys.argv[0]).name == "train.py" else "xplanes train"
 
 
 def resume_command(run: Path) -> str:
-    """What a user types in a shell to go on with a run."""
+    """The shell command that resumes a run."""
     return f"{train_command()} {shlex.quote(f'resume={run}')}"

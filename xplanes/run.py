@@ -46,20 +46,20 @@ from xplanes.training.record import (
 logger = logging.getLogger(__name__)
 
 KNOWN_ERRORS = (XPlanesError, MisconfigurationException)
-"""Errors that are reported by their message; the traceback is written to train.log only."""
+"""Errors reported by their message alone; the traceback is written to train.log only."""
 
 
 REFUSALS = (ConfigError, SceneError, LRMError, MissingExtraError)
-"""Errors of a run that cannot begin with its settings, its data or its weights."""
+"""Errors in settings, data or weights: the run cannot begin."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A run that can begin: its settings are parsed, its Trainer is built, nothing is written.
+    """A run that is ready to begin: settings parsed, Trainer built, nothing written yet.
 
     Attributes:
         experiment: The settings.
-        trainer: With callbacks and loggers.
+        trainer: The Trainer, with callbacks and loggers.
         folder: The run directory, which need not exist yet.
         new: Whether it did not exist.
     """
@@ -94,10 +94,10 @@ def run(
     Args:
         config: The resolved configuration, builtins only.
         folder: The run directory.
-        overrides: What the command line changed.
+        overrides: Overrides from the command line.
         resume: Whether to continue the run in ``folder``.
-        job: What `prepare` has made of the configuration; made here when None.
-        began: When the run began, as `time.perf_counter` counts; now when None.
+        job: Result of `prepare` for the configuration; prepared here when None.
+        began: Start of the run on the clock of `time.perf_counter`; now when None.
 
     Returns:
         PSNR of the scored split in dB; NaN in helper processes of a distributed run.
@@ -108,7 +108,7 @@ def run(
         KeyboardInterrupt: If the user stopped it; the state is saved.
     """
     if resume and isinstance(root := config.get("data", {}).get("root"), str):
-        # It may be relative to the folder in which the run was started.
+        # The path may be relative to the folder in which the run was started.
         found = found_root(folder, root)
         job = job if found == root else None
         config = config | {"data": config["data"] | {"root": found}}
@@ -129,7 +129,7 @@ def run(
     except REFUSALS:
         if claimed and job.new and not has_checkpoint(folder):
             shutil.rmtree(folder, ignore_errors=True)
-            with suppress(OSError):  # It holds other runs.
+            with suppress(OSError):  # The parent folder may hold other runs.
                 folder.parent.rmdir()
         raise
     except OSError as problem:
@@ -139,7 +139,7 @@ def run(
 
 
 def _recorded(job: Job, overrides: list[str], *, resume: bool, began: float | None) -> float:
-    """Train with run.json and train.log kept, and give PSNR."""
+    """Train, keep run.json and train.log, and return the PSNR."""
     folder = job.folder
     with logged(folder / "train.log"):
         record = RunRecord(folder, job.experiment.method.seed, resume=resume, began=began)
@@ -148,11 +148,11 @@ def _recorded(job: Job, overrides: list[str], *, resume: bool, began: float | No
             record.end("finished")
         except KeyboardInterrupt:
             record.end("interrupted")
-            say(f"\nstopped. Go on with: {resume_command(folder)}")
+            say(f"\nstopped. Resume with: {resume_command(folder)}")
             raise
         except BaseException as error:
             logger.error("failed\n%s", traceback.format_exc())
-            # On a full disk the record stays "running", as after a power cut; resume= takes both.
+            # On a full disk the status stays "running", as after a power cut; resume= accepts both.
             with suppress(StorageError):
                 record.end("failed", f"{type(error).__name__}: {error}")
             if not isinstance(error, REFUSALS):
@@ -190,7 +190,7 @@ def train(
     loaded = time.perf_counter() - warm_up.seconds - began
 
     # Initialisation and field
-    # Made before the initialisation: Lightning keeps the local variables of its caller alive.
+    # Built before the initialisation: Lightning keeps the local variables of its caller alive.
     module = RadianceModule(method)
     found = Initialisation(method.model, frame)
     if source is not None:
@@ -201,7 +201,7 @@ def train(
     module.build(scene, frame, device=device, initialise=lambda *_: found)
     loaded += time.perf_counter() - warm_up.seconds - began
     found = module.initialisation or found
-    loaded -= found.seconds["fill"]  # What an initialised field alone takes is preparation.
+    loaded -= found.seconds["fill"]  # Filling the grid of an initialised field is preparation.
 
     # Training
     if record is not None:
@@ -251,5 +251,5 @@ def train(
 
 
 def say(text: str) -> None:
-    """Print a line at once."""
+    """Print a line without buffering."""
     print(text, flush=True)

@@ -1,7 +1,7 @@
-"""Typed settings: dataclasses whose types, ranges and choices are checked where they are built.
+"""Typed settings: dataclasses that check types, ranges and choices when they are built.
 
-A component of a run is such a class and a YAML file that names it as ``_target_``. Must stay quick
-to import: it knows neither torch nor Hydra.
+A component of a run is such a class and a YAML file that names it as ``_target_``. Must import
+fast, hence without torch and Hydra.
 """
 
 import difflib
@@ -50,7 +50,7 @@ ABOVE_0, FROM_0, SHARE = Range(0, open=True), Range(0), Range(0, 1)
 HOME = "~ is the user's folder"
 
 Location = Annotated[str, HOME]
-"""A file or folder; ``~`` at its beginning becomes the user's folder."""
+"""A file or folder; a leading ``~`` becomes the user's home directory."""
 Count = Annotated[int, ABOVE_0]
 """A whole number above 0."""
 Positive = Annotated[float, ABOVE_0]
@@ -67,8 +67,8 @@ Share = Annotated[float, SHARE]
 class Settings:
     """Base of all settings. Subclasses are frozen dataclasses with keyword arguments.
 
-    All values are checked when an object is made; `xplanes.components.build` makes one, with the
-    settings nested in it, of plain values.
+    All values are checked on construction; `xplanes.components.build` makes an object, with its
+    nested settings, from builtins.
     """
 
     def __post_init__(self) -> None:
@@ -87,7 +87,7 @@ class Settings:
 
     @classmethod
     def require_names(cls, names: Iterable[str]) -> None:
-        """Refuse names that are not those of this class's settings.
+        """Refuse names that are not settings of this class, and missing ones.
 
         Raises:
             ConfigError: For a name that does not exist, or one that is missing.
@@ -104,7 +104,7 @@ class Settings:
                 raise ConfigError(f"{name}: it is not set")
 
     def plain(self) -> dict[str, Any]:
-        """The same as builtins, with the class as ``_target_``."""
+        """The settings as builtins, with the class as ``_target_``."""
         content: dict[str, Any] = {"_target_": f"{type(self).__module__}.{type(self).__qualname__}"}
         for entry in fields(self):
             value = getattr(self, entry.name)
@@ -132,7 +132,7 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def check_arguments(function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
-    """Refuse plain values that are not of the types and ranges of a function's annotations.
+    """Refuse values outside the types and ranges of a function's annotations.
 
     Raises:
         ConfigError: With the argument, its value and what is allowed.
@@ -151,14 +151,14 @@ def hints_of(cls: type) -> tuple[tuple[str, Any], ...]:
 
 
 def _converted(value: Any, hint: Any) -> Any:
-    """A plain value in the form of a type: numbers as floats or as text, sequences as lists."""
+    """A value converted to a type: numbers to float or text, sequences to lists."""
     kinds, _ = kinds_of(hint)
     if isinstance(value, str) and _is_location(hint):
         return at_home(value)
     if float in kinds and int not in kinds and type(value) is int:
         return float(value)
     if type(value) in (int, float) and not {int, float} & set(kinds):
-        # The command line reads 32 as a number also where text is wanted.
+        # Hydra reads 32 as a number even where a string is expected.
         choices = [choice for kind in kinds for choice in get_args(kind)]
         if str in kinds or str(value) in choices:
             return str(value)
@@ -169,7 +169,7 @@ def _converted(value: Any, hint: Any) -> Any:
 
 
 def at_home(path: str) -> str:
-    """A path with ``~`` at its beginning expanded; unchanged if there is no such home."""
+    """A path with a leading ``~`` expanded; unchanged if that home directory does not exist."""
     if not path.startswith("~"):
         return path
     try:

@@ -1,4 +1,4 @@
-"""Stateless random numbers: each use has a stream of its own, numbered here."""
+"""Stateless random numbers: each use has its own stream, numbered here."""
 
 import math
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ GOLDEN, MIX = 0x9E3779B97F4A7C15, (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 
 @unique
 class Stream(IntEnum):
-    """What random numbers are for. Ray batches take the rank of their process, from 0 on."""
+    """Uses of random numbers. Ray batches use the rank of their process, counted from 0."""
 
     GRID = 1_000_003
     """Points at which the occupancy grid is updated, the same on all ranks."""
@@ -26,9 +26,9 @@ class Stream(IntEnum):
     JITTER = 1_000_039
     """Positions of samples, for samplers that need more than one number per ray."""
     TURNTABLE = 1_000_061
-    """Points at which the grid of a triplane's turntable is filled."""
+    """Points at which a triplane's occupancy grid is filled for its turntable video."""
     FILL = 1_000_081
-    """Points at which the grid of an initialised field is filled."""
+    """Points at which the occupancy grid of an initialised field is filled."""
     BASELINE_FIELD = 1_000_099
     """Initial values of the baselines' fields."""
     SAMPLER = 1_000_117
@@ -44,32 +44,32 @@ class Stream(IntEnum):
     VIEWS = 1_000_303
     """Order of the training views, where a batch is a whole view."""
     SPLITTING = 1_000_333
-    """Where the halves of split Gaussians go."""
+    """Positions of the halves of split Gaussians."""
     TIME_NOISE = 1_000_357
-    """Noise on the times at which Gaussians are deformed."""
+    """Noise on the input times of the Gaussians' deformation network."""
     SIGHT = 1_000_381
-    """Rays along which points of a field are searched."""
+    """Rays along which surface points of a field are searched."""
     SPARSITY = 1_000_403
-    """Points at which the sparsity prior is taken; processes add their rank."""
+    """Points at which the sparsity prior is evaluated; processes add their rank."""
     THINNING = 1_000_427
-    """Samples whose gradients are taken."""
+    """Choice of the samples that receive gradients."""
     UNSEEN = 1_000_507
-    """Rays along which the background has its usual colour unless views show another."""
+    """Random rays of the prior on the background's unseen directions."""
 
 
 def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:
-    """A generator that depends on nothing but its arguments.
+    """A generator that depends only on its arguments.
 
     Args:
         seed: The run's seed.
         step: The training step.
-        stream: Tells independent uses apart: a `Stream`, or the rank of a process.
+        stream: Separates independent uses: a `Stream`, or the rank of a process.
     """
     return torch.Generator().manual_seed(_key(seed, step, stream))
 
 
 def _key(seed: int, step: int, stream: int) -> int:
-    """64 bits of a triple; odd constants spread neighbouring ones over them (splitmix64)."""
+    """A 64-bit hash of a triple; odd constants spread neighbouring triples (splitmix64)."""
     key = (seed * GOLDEN + step * MIX[0] + stream * MIX[1]) % 2**64
     key = ((key ^ (key >> 30)) * MIX[0]) % 2**64
     key = ((key ^ (key >> 27)) * MIX[1]) % 2**64
@@ -79,14 +79,14 @@ def _key(seed: int, step: int, stream: int) -> int:
 def counted_uniform(
     seed: int, step: int, stream: int, shape: tuple[int, ...], device: torch.device
 ) -> Tensor:
-    """Random numbers from 0 to 1, each a function of its place: the same bits on every device.
+    """Uniform random numbers, each a function of its index: bit-identical on every device.
 
     Args:
         seed: The run's seed.
         step: The training step.
-        stream: Tells independent uses apart: a `Stream`, or the rank of a process.
+        stream: Separates independent uses: a `Stream`, or the rank of a process.
         shape: Shape of the result.
-        device: Where they are made, without waiting for the host.
+        device: Device of the result; it is not synchronised with the host.
 
     Returns:
         Multiples of 2^-53 below 1. float64 [...]
@@ -107,13 +107,13 @@ def _signed(number: int) -> int:
 
 
 def _shifted(bits: Tensor, by: int) -> Tensor:
-    """A logical shift to the right; that of int64 would repeat the sign."""
+    """A logical shift to the right; int64's own shift would repeat the sign bit."""
     return (bits >> by) & (2 ** (64 - by) - 1)
 
 
 @contextmanager
 def initial_values(seed: int, stream: Stream) -> Iterator[None]:
-    """Draw random numbers of torch from a stream of the seed, and leave other streams alone."""
+    """Seed torch's global generator from a stream within the block, then restore its state."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(step_generator(seed, 0, stream).initial_seed())
         yield
@@ -121,14 +121,14 @@ def initial_values(seed: int, stream: Stream) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class TrainingState:
-    """How far training is.
+    """Progress of training.
 
     Attributes:
         seed: The run's seed.
         step: Optimiser steps done.
         batch: Batches drawn before this one.
         rank: Number of this process among those that split the rays.
-        progress: Share of the budget that is spent.
+        progress: Share of the budget that has been used.
     """
 
     seed: int
@@ -138,6 +138,6 @@ class TrainingState:
     progress: float = 0.0
 
     def generator(self, device: torch.device, stream: Stream = Stream.JITTER) -> torch.Generator:
-        """Random numbers of this batch, rank and stream, and of nothing else."""
+        """A generator that depends only on the seed, this batch, the rank and the stream."""
         key = step_generator(self.seed, self.batch, stream + self.rank).initial_seed()
         return torch.Generator(device).manual_seed(key)

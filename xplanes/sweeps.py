@@ -1,4 +1,4 @@
-"""Sweeps: the jobs that they consist of, and what is looked for before the first one."""
+"""Sweeps: their list of jobs, and checks before the first one."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 
 GRIDS = (".RowSweeper", ".BasicSweeper")
-"""Sweepers whose jobs are known before they begin."""
+"""Sweepers whose jobs are known in advance."""
 
 SMALL = "experiment=demo"
-"""Chooses the small version of a sweep."""
+"""Override that chooses the small version of a sweep."""
 
 
 def jobs(hydra: Mapping[str, Any], loader: ConfigLoader | None = None) -> list[list[str]]:
@@ -63,10 +63,10 @@ def _by_key(overrides: Sequence[str]) -> dict[str, str]:
 
 
 def look_ahead(config: DictConfig) -> str:
-    """Look for the data and weights of all jobs of a multirun before the first one begins.
+    """Check that data and weights of all jobs of a multirun exist, before the first one begins.
 
-    Weights that are not there are downloaded. Jobs check their other settings themselves, so that
-    the rest of the sweep goes on.
+    Missing weights are downloaded. Jobs check their other settings themselves, so that an invalid
+    one does not stop the sweep.
 
     Args:
         config: The configuration of the multirun.
@@ -95,7 +95,7 @@ def look_ahead(config: DictConfig) -> str:
     runs = [run for job in found if (run := known[job]) is not None]
     for data in {str(run.data): run.data for run in runs}.values():
         if data.files and not data.folder.exists():
-            data.load(("train",))  # It says where to get the scene.
+            data.load(("train",))  # Its error says where to get the scene.
     for lrm in {str(run.method.lrm): run.method.lrm for run in runs}.values():
         lrm.load()
     return _length(len(found), [run.trainer for run in runs])

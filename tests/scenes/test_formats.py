@@ -173,12 +173,12 @@ def test_masks_and_cameras_of_turned_photos_say_exif(tmp_path: Path) -> None:
     read = partial(settings, ColmapSettings, "colmap", folder, static=True)
     said = assert_refused(
         SceneError,
-        r"EXIF orientation says that it is shown turned.*magick mogrify -rotate 270",
+        r"EXIF orientation rotates it for display.*magick mogrify -rotate 270",
         partial(read(masks="masks").load, ["train"]),
         "masks",
     )
     assert all(f"{name}.png has 30x40 pixels" in said for name in names)
     write_colmap(folder / "sparse/0", {1: ("SIMPLE_PINHOLE", HEIGHT, WIDTH, lens)}, images)
-    words = r"EXIF orientation.*calibrated with the turned image.*-auto-orient"
+    words = r"EXIF orientation.*calibrated with the rotated image.*-auto-orient"
     said = assert_refused(SceneError, words, partial(read().load, ["train"]), "cameras")
     assert all(f"{name} has 40x30 pixels" in said for name in names)

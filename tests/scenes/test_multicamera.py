@@ -479,7 +479,7 @@ def test_a_camera_that_begins_later_is_told_of(tmp_path: Path) -> None:
         late = 400 if camera == 2 else 0
         stamps = [late + 33 * number for number in range(FRAMES)]
         write_stamped(folder / f"cam0{camera}.mkv", rgb(camera), stamps)
-    with pytest.warns(UserWarning, match=r"cam02\.mkv begins 0\.4 s after .*cut the videos"):
+    with pytest.warns(UserWarning, match=r"cam02\.mkv begins 0\.4 s after .*trim the videos"):
         assert read(folder).splits["train"].times[:FRAMES].tolist() == pytest.approx(
             [number / (FRAMES - 1) for number in range(FRAMES)]
         )

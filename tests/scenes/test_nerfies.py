@@ -209,7 +209,7 @@ def test_other_files_that_cannot_be(capture):
     wrong("scene.json", r"center is \[1, 2\]; it must be 3 numbers", center=[1, 2])
     wrong("dataset.json", "train_ids is 'all'; it must be a list", train_ids="all")
     wrong("dataset.json", "train_ids lists 000001 twice", train_ids=["000001"] * 2)
-    wrong("dataset.json", "1 images are to be trained on and to be scored", val_ids=["000000"])
+    wrong("dataset.json", "1 images are listed both for training", val_ids=["000000"])
     wrong("dataset.json", "ids is None; it must be a list", ids=..., train_ids=..., val_ids=...)
     wrong("metadata.json", "warp_id of 000003 is 'x'; it must be", **{"000003": {"warp_id": "x"}})
     save(capture.path.parent / "secret.png", picture(0))

@@ -182,7 +182,7 @@ def test_lists_of_file_names_are_the_splits(capture):
         capture.refused(words, change)
     capture.content = whole
     capture.frames.pop(5)
-    capture.refused("train_filenames names images/frame_00005.png, which no frame shows")
+    capture.refused("train_filenames names images/frame_00005.png, which is in no frame")
 
 
 @pytest.mark.parametrize("key", ["time", "timestamp"])
@@ -562,7 +562,7 @@ def test_intrinsics_as_programs_write_them(capture, place, keys, expected, words
 
 
 def test_focal_lengths_that_disagree_with_fields_of_view(capture):
-    with pytest.warns(UserWarning, match="frame 0 .*fl_x=30 is followed, but camera_angle_x m"):
+    with pytest.warns(UserWarning, match="frame 0 .*fl_x=30 is used, but camera_angle_x m"):
         focal_lengths(capture, fl_x=30, w=SIZE, h=SIZE, camera_angle_x=ANGLE)
 
 

@@ -43,9 +43,9 @@ def add_gram(total: Tensor, block: Tensor, *, double: bool) -> None:
 def needs_double(largest: float, threshold: float, tolerance: float) -> bool:
     """Whether a float32 Gram matrix is too coarse for this threshold.
 
-    Squaring leaves an error of about 1e-8 times the largest SQUARED singular value (rounding within
-    a block; the sum over blocks is float64). Relative to the thresholded matrix it was measured as
-    3e-9 to 1e-8 ``largest / threshold``; a tenth of the tolerance is left to the smaller figure.
+    Squaring gives an error of about 1e-8 times the largest SQUARED singular value (rounding within
+    a block; the sum over blocks is float64). Relative to the thresholded matrix, measurements gave
+    3e-9 to 1e-8 ``largest / threshold``; the smaller value must be below a tenth of the tolerance.
 
     Args:
         largest: Largest singular value.
@@ -56,7 +56,7 @@ def needs_double(largest: float, threshold: float, tolerance: float) -> bool:
 
 
 def shrinkage_from_gram(gram: Tensor, threshold: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Directions kept by singular value thresholding, and the factor that shrinks each.
+    """Singular directions kept by thresholding, and the shrinkage factor of each.
 
     Thresholding is the proximal operator of the nuclear norm (X-Planes, Eq. 24-25).
 
@@ -190,7 +190,7 @@ def iterate(
 
 
 def finish(work: Workspace, low_rank: Tensor, step: Step) -> None:
-    """Make one plain iteration; write L to ``low_rank`` and overwrite the state with S.
+    """Make one iteration without relaxation; write L to ``low_rank`` and S over the state.
 
     Args:
         work: The blocks; their state becomes the sparse part.
@@ -218,7 +218,7 @@ def _squared(block: Tensor) -> Tensor:
 class Schedule:
     """Schedule of the penalty, and over-relaxation.
 
-    The adaptive values minimise the iterations to a given error on feature-like matrices.
+    The adaptive values minimise the number of iterations on matrices like LRM features.
 
     Attributes:
         relaxation: Over-relaxation of the low-rank part; 1 is plain ADMM.
@@ -310,7 +310,7 @@ class Penalty:
         self._rate = self._growth**direction
 
     def advance(self, iteration: int, norms: Norms) -> None:
-        """Go on to the next iteration."""
+        """Advance to the next iteration."""
         self.before, self.now = self.now, self.after
         if self.warm(iteration):
             sparse = max(norms.sparse, _SPARSE_FLOOR * self._norm)

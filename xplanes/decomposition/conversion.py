@@ -115,7 +115,7 @@ def shared_factors(sparse: Tensor, rows: Rows) -> list[Tensor]:
     few = max(1, _SLICES // sparse.shape[2])
     parts = [_shared_in_cache(frames, rows) for frames in sparse.split(few)]
     factors = [torch.cat(pieces) for pieces in zip(*parts, strict=True)]
-    # Products keep their values only if all factors that they join are flipped together.
+    # Products keep their values only if all factors that they connect are flipped together.
     for group in _joined(rows):
         signs = _running_signs(*(factors[place] for place in group))
         for place in group:
@@ -149,7 +149,7 @@ def _shared_in_cache(sparse: Tensor, rows: Rows) -> list[Tensor]:
 
 
 def _joined(rows: Rows) -> list[set[int]]:
-    """Factors that products join, directly or through others."""
+    """Groups of factors that are connected by products, directly or through others."""
     groups: list[set[int]] = []
     for pair in rows:
         touched = [group for group in groups if group & set(pair)]
@@ -159,7 +159,7 @@ def _joined(rows: Rows) -> list[set[int]]:
 
 
 def _solve(products: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
-    """The factor that, times the other of each product, is nearest to the product's plane."""
+    """Least-squares factor, given the other factor and the target plane of each product."""
     right_side = sum(plane @ other for plane, other in products)
     weight = sum(other.square().sum(-2, keepdim=True) for _, other in products)
     assert isinstance(right_side, Tensor)

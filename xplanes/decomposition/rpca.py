@@ -91,8 +91,8 @@ def robust_pca(
     penalty does: with ``scale="rms"``, ``penalty`` is divided by the root mean square of Y.
     "adaptive" always divides it and uses it only as the initial value.
 
-    Besides the two results, which have the size of Y, memory use is four cache-sized blocks. A
-    matrix that is neither float32 nor float64, or not contiguous in rows or columns, is copied.
+    Memory use is the two results, each of the size of Y, and four cache-sized blocks. A matrix that
+    is neither float32 nor float64, or not contiguous in rows or columns, is copied.
 
     Args:
         matrix: Y, of any floating-point type; not modified. Half precision is computed and returned
@@ -102,8 +102,8 @@ def robust_pca(
         penalty: Penalty of ADMM, above 0; the initial one for "adaptive".
         tolerance: Bound on ``|L + S - Y| / |Y|``, above 0; "adaptive" also requires a relative step
             below ten times this. float32 cannot reach much below 1e-6.
-        max_iterations: Maximum number of iterations, at least 1. A warning is given if they do not
-            suffice.
+        max_iterations: Maximum number of iterations, at least 1. Warns if they do not reach the
+            tolerance.
         method: "adaptive" (over-relaxed ADMM with a balanced penalty that then grows no faster
             than the split converges) or "admm" (the paper's Algorithm 1).
         scale: Unit of Y for the penalty: "rms" (root mean square) or "none" (1).
@@ -206,7 +206,7 @@ def _check_matrix(matrix: Tensor) -> float:
         raise ValueError(f"robust_pca needs a non-empty matrix [M, T], not {tuple(matrix.shape)}")
     low, high = torch.aminmax(matrix)
     peak = max(abs(low.item()), abs(high.item()))
-    # Comparisons with NaN are false.
+    # Both checks fail for NaN.
     if not (math.isfinite(low.item()) and math.isfinite(high.item())):
         raise ValueError(
             "the input of robust_pca contains NaN or infinity: check the triplanes or features "

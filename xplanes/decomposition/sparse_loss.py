@@ -71,9 +71,9 @@ def unexplained_energy(time_planes: Tensor, sparse: Tensor, *, rows: Rows) -> fl
 class SparseProduct:
     """The regulariser L_r, at a few random frames per step or at all of them.
 
-    With |S - b a^T|^2 = |S|^2 - 2 b^T S a + |a|^2 |b|^2, for profiles a and b of two time planes, a
-    gradient takes products of matrices and vectors, and nothing of the size of S is formed.
-    `sparse_product_loss` is the same, written for reading.
+    With |S - b a^T|^2 = |S|^2 - 2 b^T S a + |a|^2 |b|^2, for profiles a and b of two time planes,
+    the gradient needs only matrix-vector products, without temporaries of the size of S.
+    `sparse_product_loss` is the reference implementation.
 
     It is not a module: the sparse part is large, can be recomputed, and must not be written to
     checkpoints. Copies share it.
@@ -82,7 +82,7 @@ class SparseProduct:
         sparse: The sparse part of all frames. [T, 3, C, H, W]
         rows: For xy, xz and yz: indices of their two time planes.
         count: Frames per step; None for all.
-        reduction: "mean" over all entries of the sparse part, or their "sum", as Eq. 17 has it.
+        reduction: "mean" over all entries of the sparse part, or their "sum", as in Eq. 17.
 
     Raises:
         ValueError: For another reduction.
@@ -127,7 +127,7 @@ class SparseProduct:
         self._follow(planes)
         total = len(self.sparse)
         frames = torch.tensor(spread(self.count or total, total))
-        # One at a time: their errors have the size of the sparse part.
+        # One frame at a time: the errors of all would have the size of the sparse part.
         errors = [
             sparse_product_loss(planes, self.sparse, frame, rows=self.rows)
             for frame in frames.split(1)
@@ -135,7 +135,7 @@ class SparseProduct:
         return self.factor * float(torch.stack(errors).mean())
 
     def _follow(self, planes: Tensor) -> None:
-        """Move the sparse part to where the planes are."""
+        """Move the sparse part to the device of the planes."""
         self.sparse = self.sparse.to(planes.device, planes.dtype)
 
     def _varying(self, planes: Tensor, target: Tensor, frames: Tensor) -> Tensor:

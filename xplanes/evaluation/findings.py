@@ -1,4 +1,4 @@
-"""What may be wrong with a capture: findings, each with its numbers and a remedy."""
+"""Possible problems of a capture, each with numbers and a remedy."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,31 +18,31 @@ GAP_SPACINGS, GAP_SPAN = 12.0, 0.05
 """Shortest gap in time that is reported: in median spacings, and as a share of the span."""
 
 SHORT_SPAN = 0.2
-"""Share of [0, 1] that times should cover; less suggests wrong scaling."""
+"""Least share of [0, 1] that times should cover; less suggests wrong scaling."""
 
 ASTRAY = 0.1
-"""Share of the cameras that may miss the centre of the cube."""
+"""Largest acceptable share of cameras that do not see the centre of the cube."""
 
 SMALL, LARGE = 0.03, 3.0
-"""Bounds of half the cube's side, in median distances of the cameras."""
+"""Range of plausible half sides of the cube, in units of the cameras' median distance."""
 
 PALE_STEPS = 16
-"""Difference of colours, of 255, below which two pixels look alike."""
+"""Colour difference, out of 255, below which two pixels count as equal."""
 
 HALO = 0.03
 """Width of the soft edge around a silhouette, as a share of the image's longer side."""
 
 AT_START = 32
-"""Most images that are read at the start of a run, spread evenly; they may lie on the disk."""
+"""Maximum number of images, evenly spread, that are checked at the start of a run."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that may be wrong.
+    """A possible problem.
 
     Attributes:
-        kind: Name of what it is about, for programs.
-        text: What it is, with numbers, and what to do.
+        kind: Kind of the problem, for programs.
+        text: The problem, with numbers, and the remedy.
     """
 
     kind: str
@@ -50,7 +50,7 @@ class Finding:
 
 
 def stray_pixels(alpha: Tensor) -> int:
-    """Pixels with alpha, but away from the silhouette: noise, not soft edges."""
+    """Number of pixels with alpha away from the silhouette: noise rather than soft edges."""
     side = max(1, round(HALO * max(alpha.shape)))
     held = count_in_squares(silhouette_of(alpha), side) > 0
     near = F.max_pool2d(held.float()[None], 3, stride=1, padding=1)[0] > 0
@@ -58,11 +58,11 @@ def stray_pixels(alpha: Tensor) -> int:
 
 
 def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
-    """Problems that cameras and times show, and views that two splits share.
+    """Problems of cameras and times, and views that two splits share.
 
     Args:
-        scene: The scene; its training views and those that are scored.
-        frame: The field's frame; None where none was found.
+        scene: The scene, with its training views and those that are scored.
+        frame: The field's frame; None if none could be estimated.
     """
     train = scene.splits["train"]
     yield from _times(scene, train)
@@ -76,17 +76,17 @@ def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
 
 
 def opaque_findings(scene: Scene) -> Iterator[Finding]:
-    """Whether opaque training images show objects in front of a plain background."""
+    """Finds opaque training images of objects in front of a constant background."""
     if scene.splits["train"].is_opaque and not scene.is_surrounded:
         yield Finding(
             "white",
-            "the images are opaque and end in the background's colour: a field that is empty there "
-            "and one that is filled look the same. Write RGBA images or masks",
+            "the images are opaque and end in the background's colour: there an empty field and a "
+            "filled one look the same. Write RGBA images or masks",
         )
 
 
 def stray_findings(scene: Scene) -> Iterator[Finding]:
-    """Whether training images, of which some are read, have alpha away from their silhouettes."""
+    """Finds training images, among a sample, with alpha away from their silhouettes."""
     views = scene.splits["train"]
     if not views.is_opaque:
         chosen = spread(AT_START, len(views))
@@ -95,12 +95,12 @@ def stray_findings(scene: Scene) -> Iterator[Finding]:
 
 
 def time_steps(views: Views) -> Tensor:
-    """The views' different times, in order. [T]"""
+    """The views' distinct times, in ascending order. [T]"""
     return views.times.double().unique()
 
 
 def time_gaps(views: Views) -> list[tuple[float, float]]:
-    """Gaps between times that are far longer than the usual spacing: first and last time."""
+    """Gaps far longer than the median spacing of times, each as its first and last time."""
     times = time_steps(views)
     if len(times) < 5:
         return []
@@ -121,7 +121,7 @@ def _times(scene: Scene, train: Views) -> Iterator[Finding]:
             "times",
             f"no training view shows the times between {longest[0]:.3g} and {longest[1]:.3g}, "
             f"{(longest[1] - longest[0]) / float(times.diff().median()):.0f} times the median "
-            f"spacing{more}: the field can only guess there. Add views, or correct the times",
+            f"spacing{more}: the field is not supervised there. Add views, or correct the times",
         )
     span = float(times[-1] - times[0])
     if 0 < span < SHORT_SPAN:
@@ -129,15 +129,15 @@ def _times(scene: Scene, train: Views) -> Iterator[Finding]:
             "times",
             f"training times run from {float(times[0]):.3g} to {float(times[-1]):.3g}, "
             f"{span:.0%} of [0, 1]: most of the field's timesteps are never seen. Divide frame "
-            "numbers by the last one",
+            "numbers by the last frame number",
         )
     if span == 0 and not scene.static_reason and (pair := _same_camera_other_image(train)):
         first, second = (train.files[i] for i in pair)
         yield Finding(
             "one_time",
             f"all training views have the time {float(times[0]):.3g}, but {first} and {second} "
-            "have one camera and differ: the scene moves. Give every image its time, or take those "
-            "of one timestep alone",
+            "have one camera and differ: the scene moves. Give every image its time, or use only "
+            "images of one timestep",
         )
 
 
@@ -155,7 +155,7 @@ def _same_camera_other_image(views: Views) -> tuple[int, int] | None:
 
 
 def shared(scene: Scene) -> Iterator[Finding]:
-    """Scored views that are training views by their file, or by camera and time."""
+    """Scored views that are also training views, by their file or by camera and time."""
     train = scene.splits["train"]
     names = dict(zip(train.files, range(len(train)), strict=True))
     poses = train.camera_to_world.double()
@@ -178,13 +178,13 @@ def shared(scene: Scene) -> Iterator[Finding]:
 def shared_finding(
     split: str, views: Views, found: list[tuple[str, str]], what: str
 ) -> Iterator[Finding]:
-    """Scored views, each with its training view, that have the same of something."""
+    """The finding for pairs of a scored and a training view that are equal in ``what``."""
     for file, other in found[:1]:
         yield Finding(
             "shared",
             f"{len(found)} of {len(views)} {split} views are training views too, by the same "
-            f"{what} ({file} is {other}): scores would flatter the field. Take them out of one of "
-            "the splits",
+            f"{what} ({file} is {other}): scores would be too high. Remove them from one of the "
+            "splits",
         )
 
 
@@ -200,13 +200,13 @@ def _sizes(scene: Scene) -> Iterator[Finding]:
         words = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in mixed[0].items())
         yield Finding(
             "sizes",
-            f"images of one camera differ in size ({words}): small ones count less and show less. "
+            f"images of one camera differ in size ({words}): small ones give fewer rays. "
             "Export all at one size, or set data.resolution",
         )
 
 
 def calibrations(views: Views) -> list[tuple[float, ...]]:
-    """What tells the cameras of images apart, whatever the images' sizes are. [V]"""
+    """Intrinsics of each view in a form that does not depend on the image size. [V]"""
     intrinsics = views.intrinsics
     scale = intrinsics.size.flip(1).double()
     parts = [intrinsics.focal / scale, intrinsics.centre / scale]
@@ -216,7 +216,7 @@ def calibrations(views: Views) -> list[tuple[float, ...]]:
 
 
 def _outward(views: Views) -> Finding | None:
-    """Whether the cameras look away from the point in which their axes meet."""
+    """Finds cameras that look away from the point where their axes meet."""
     axis = -backwards(views).double()
     if not axes_meet(views):
         return None  # Axes that are nearly parallel may meet anywhere.
@@ -227,14 +227,14 @@ def _outward(views: Views) -> Finding | None:
     return Finding(
         "axes",
         f"{away} of {len(views)} cameras look away from the point where their axes meet. Axes must "
-        "be OpenGL's (x right, y up, z backward): where those of the file are OpenCV's (y down, z "
+        "be OpenGL's (x right, y up, z backward): if those of the file are OpenCV's (y down, z "
         "forward), negate the second and third column of every pose. Cameras that do look outward, "
         "as in a panorama, see no common volume",
     )
 
 
 def pixels_of(views: Views, index: int, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where an image shows world points [N, 3]: what `project` gives for its camera. [N] each"""
+    """Projection of world points [N, 3] into an image, as in `project`. [N] each"""
     intrinsics = views.intrinsics
     return project(
         views.camera_to_world[index],
@@ -246,7 +246,7 @@ def pixels_of(views: Views, index: int, points: Tensor) -> tuple[Tensor, Tensor,
 
 
 def sees_centre(views: Views, frame: Frame) -> Tensor:
-    """Which cameras have the centre of the cube in their image. bool [V]"""
+    """Whether each camera has the centre of the cube in its image. bool [V]"""
     found = torch.zeros(len(views), dtype=torch.bool)
     for index in range(len(views)):
         column, row, seen = pixels_of(views, index, frame.centre[None])
@@ -289,9 +289,9 @@ def stray_finding(counts: Sequence[tuple[str, int]]) -> Iterator[Finding]:
         names = some([f"{file} ({count})" for file, count in found])
         yield Finding(
             "stray",
-            f"{len(found)} of {len(counts)} images have stray pixels, whose alpha is faint or "
-            f"which stand alone: {sum(count for _, count in found)} in all, in {names}. They are "
-            "trained on, but count as empty space when the cube and the silhouettes are found. "
+            f"{len(found)} of {len(counts)} images have stray pixels, which are faint or "
+            f"isolated: {sum(count for _, count in found)} in all, in {names}. They are trained "
+            "on, but count as empty space when the cube and the silhouettes are estimated. "
             "Clear their alpha; if they show a part of the scene, set data.half_side and "
             "model.sampler.silhouettes=false",
         )

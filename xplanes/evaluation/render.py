@@ -19,11 +19,11 @@ from xplanes.scenes.views import Scene, Views
 from xplanes.training.module import RadianceModule
 
 ELEVATION = 20.0
-"""Height angle of the turning camera, in degrees."""
+"""Elevation of the orbiting camera, in degrees."""
 
 
 def orbit_poses(views: Views, frame: Frame, count: int, elevation: float = ELEVATION) -> Tensor:
-    """Cameras around the scene, as far from it as the training cameras are. [count, 4, 4]"""
+    """Poses on an orbit around the scene, at the training cameras' distance. [count, 4, 4]"""
     distance = (views.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1).median()
     return orbit(count, radius=float(distance), elevation=elevation, target=frame.centre)
 
@@ -42,14 +42,14 @@ def render_path(
     """Render frames along a path of cameras and times, one at a time.
 
     Args:
-        field: What the renderer takes as a field.
-        renderer: Renders it.
+        field: A field that the renderer accepts.
+        renderer: The renderer.
         frame: The field's frame.
         cameras: The camera of each frame, in the world.
         times: Time of each frame, from 0 to 1. [F]
         background: Colour behind the scene. [3]
-        what: ``colour``, or ``depth`` as colours whose scale is the same in all frames.
-        shown: Pixels that the lens has rays for, the others stay empty; all when None. bool
+        what: ``colour``, or ``depth`` as colours on the same scale in all frames.
+        shown: Pixels for which the lens has a ray, the others are empty; all when None. bool
             [rows, columns]
 
     Yields:
@@ -66,10 +66,10 @@ def render_path(
 
 
 def _depth(image: dict[str, Tensor], distance: float) -> Tensor:
-    """Depth as colours, near is light; white where there is nothing. [H, W, 3]
+    """Depth as colours: near is light, empty is white. [H, W, 3]
 
-    The scale is that of the field's cube seen from ``distance``. A scale of each frame's own would
-    make a video flicker.
+    The scale is that of the field's cube seen from ``distance``. A separate scale for each frame
+    would make a video flicker.
     """
     colours = colour_map(0.5 + 0.5 * (distance - image["depth"]))
     return torch.lerp(torch.ones_like(colours), colours, image["opacity"][..., None])
@@ -126,7 +126,7 @@ def write_video(path: Path, frames: Iterable[Tensor], *, fps: int, folder: bool 
         _write_image(path, next(iter(frames)))
     elif path.suffix == ".mp4":
         imageio = require("imageio.v2", extra="video")
-        # imageio would resize frames to multiples of 16 if it were not told otherwise.
+        # By default imageio resizes frames to multiples of 16.
         options = {"fps": fps, "macro_block_size": 2, "quality": 8}
         with replacing(path) as temporary, imageio.get_writer(temporary, **options) as writer:
             for frame in frames:
@@ -142,15 +142,15 @@ def write_video(path: Path, frames: Iterable[Tensor], *, fps: int, folder: bool 
 
 def _write_image(path: Path, frame: Tensor) -> None:
     with replacing(path) as temporary:
-        # The quality is that of JPEG files.
+        # Only JPEG files have a quality.
         Image.fromarray(frame.numpy()).save(temporary, format=IMAGES[path.suffix], quality=95)
 
 
 IMAGES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
-"""Formats of files with one frame, as Pillow calls them."""
+"""Pillow's names of the formats for single frames."""
 
 FRAMES, FPS = 48, 16
-"""Frames of a video, and how many are shown per second."""
+"""Number of frames of a run's video, and frames per second."""
 
 VIDEO_SIZE = 200
 """Pixels of the longer side of a run's own video."""

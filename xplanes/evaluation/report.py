@@ -1,4 +1,4 @@
-"""What a run reports: its first lines, metrics.json, hyperparameters, its last lines."""
+"""Reports of a run: header, metrics.json, hyperparameters, closing lines."""
 
 import math
 import shlex
@@ -27,7 +27,7 @@ from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, blank_psnr, mean_colour, mean_scores
 
 LITTLE = 0.5
-"""Gain in dB over empty images below which a run has learnt nothing."""
+"""Gain in dB over images of background alone below which a run has learnt nothing."""
 
 CLUTTERED = 0.2
 """Share of floaters above which a run warns; successful scenes have less than a tenth."""
@@ -42,7 +42,7 @@ def header(
     expected: Estimate,
     spent: float,
 ) -> str:
-    """The lines printed before training: what is about to happen, on what, from what."""
+    """The lines printed before training: software, data, model, budget and expected time."""
     assert module.frame is not None
     assert module.initialisation is not None
     scene = data.scene
@@ -86,7 +86,7 @@ def header(
 def estimated(
     experiment: Experiment, data: SceneDataModule, expected: Estimate, spent: float
 ) -> str:
-    """How long the run is going to take, ``spent`` seconds after it began, as text."""
+    """The run's expected duration as text, ``spent`` seconds after its start."""
     trainer = experiment.trainer
     steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
     train = min(steps * expected.step, trainer.get("max_seconds") or math.inf)
@@ -113,7 +113,7 @@ def estimated(
 
 
 def scored_views(limit: float, views: int) -> int:
-    """Validation views scored each time: ``trainer.limit_val_batches`` is a number or a share."""
+    """Validation views per evaluation; ``trainer.limit_val_batches`` is a number or a share."""
     return min(limit, views) if isinstance(limit, int) else int(limit * views)
 
 
@@ -131,7 +131,7 @@ def summary(
     candidates = max(1, counts["candidates"])
     tested, blank = data.scene.splits[data.test_split], data.scene.background
     if data.scene.is_surrounded:
-        blank = mean_colour(tested, blank)  # No colour is that of the background.
+        blank = mean_colour(tested, blank)  # A learnt background has no constant colour.
     return {
         "split": data.test_split,
         "test": mean_scores(scores),
@@ -159,17 +159,17 @@ def summary(
 
 def rest(seconds: dict[str, Any], total: float) -> dict[str, float]:
     """``other``, the time that no stage of ``seconds`` accounts for, and ``total``."""
-    # Stages from the cache count with what they took to make: they may exceed the run's own time.
+    # Cached stages count with their original duration, which may exceed the run's own time.
     named = sum(seconds["prepare"].values())
     named += sum(value for name, value in seconds.items() if name != "prepare")
     return {"other": max(0.0, total - named), "total": total}
 
 
 def write_pictures(trainer: Trainer, pictures: Mapping[str, Tensor], *, log: bool) -> None:
-    """Write the images of what happened before training, if anything did.
+    """Write images of the preparation to the run's media and, if wanted, to the loggers.
 
     Args:
-        trainer: Has the run directory and the loggers.
+        trainer: The Trainer, with run directory and loggers.
         pictures: By name, colours from 0 to 1. [H, W, 3] each
         log: Whether they go to the loggers too.
     """
@@ -180,7 +180,7 @@ def write_pictures(trainer: Trainer, pictures: Mapping[str, Tensor], *, log: boo
 
 
 def log_hparams(trainer: Trainer, experiment: Experiment, metrics: dict[str, Any]) -> None:
-    """The settings that runs are compared by, with their final scores."""
+    """Log the settings by which runs are compared, with the final scores."""
     method, data = experiment.method, experiment.data
     model: Any = method.model
     parameters = {
@@ -201,7 +201,7 @@ def log_hparams(trainer: Trainer, experiment: Experiment, metrics: dict[str, Any
                 assert writer.file_writer is not None
                 for summary in hparams(parameters, scores):
                     writer.file_writer.add_summary(summary)
-                for name in scores.keys() - trainer.logged_metrics.keys():  # Others are there.
+                for name in scores.keys() - trainer.logged_metrics.keys():  # The rest is logged.
                     writer.add_scalar(name, scores[name], metrics["step"])
         else:
             logger.log_hyperparams(parameters)
@@ -243,7 +243,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
         f"{100 * skipped['background']:.0f}% of pixels as background; "
         f"{metrics['samples_per_ray']:.1f} samples a ray remained"
     )
-    # Without callbacks.checkpoints there is nothing to render or to go on with.
+    # Without callbacks.checkpoints there is nothing to render or to resume.
     kept = "checkpoints/last.ckpt  " if (run / "checkpoints" / LAST).is_file() else ""
     steps = [*curves, f"xplanes render {place}{named}", resume_command(run) + more]
     steps = steps if kept else curves
@@ -265,7 +265,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
 
 
 def device_memory(device: torch.device) -> int:
-    """Most bytes held so far: on the device if it is a GPU, else by this process."""
+    """Peak memory in bytes: of the device if it is a GPU, else of this process."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     if sys.platform == "win32":

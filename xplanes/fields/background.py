@@ -1,4 +1,4 @@
-"""What lies behind the field's cube: static and unbounded, contracted to a ball of radius 2."""
+"""Static, unbounded background outside the field's cube, contracted to a ball of radius 2."""
 
 import torch
 from torch import Tensor, nn
@@ -10,20 +10,20 @@ RADIUS = 2.0
 """Radius of the ball into which `contract` maps all of space."""
 
 FARTHEST = 1e30
-"""Distance of what lies on the ball's surface."""
+"""Distance assigned to points on the ball's surface, which are infinitely far."""
 
 INITIAL_SCALE = 1e-3
 """Standard deviation of the planes' random initial values."""
 
 DARKEST = 0.02
-"""Darkest initial colour, from where it is not far to any other; 1 minus it is the brightest."""
+"""Initial colours lie between this and 1 minus this, where the sigmoid is not saturated."""
 
 DENSITY_SCALE, DENSITY_BIAS = 25.0, -2.0
-"""Of the decoder. A ray keeps about a third of its light for infinity at first."""
+"""Of the decoder. Initially about a third of a ray's light comes from infinity."""
 
 
 def contract(points: Tensor) -> Tensor:
-    """Draw all of space into a ball of radius 2; the ball of radius 1 stays as it is.
+    """Contract all of space to a ball of radius 2; the ball of radius 1 is unchanged.
 
     ``x`` becomes ``(2 - 1 / |x|) x / |x|`` where ``|x| > 1``.
 
@@ -35,7 +35,7 @@ def contract(points: Tensor) -> Tensor:
 
     Source: Mip-NeRF 360, Eq. 10.
     """
-    # The square of a large number would overflow: the largest coordinate is taken out first.
+    # The square of a large number would overflow: the largest coordinate is factored out first.
     largest = points.abs().amax(dim=-1, keepdim=True).clamp_min(1)
     share = points / largest
     length = share.norm(dim=-1, keepdim=True)
@@ -48,8 +48,8 @@ def expand(points: Tensor) -> Tensor:
     """The inverse of `contract`.
 
     Args:
-        points: Positions in the ball of radius 2; what lies on its surface, or beyond, becomes
-            `FARTHEST`. [..., 3]
+        points: Positions in the ball of radius 2; those on its surface or outside are placed at
+            distance `FARTHEST`. [..., 3]
 
     Returns:
         [..., 3]
@@ -61,17 +61,16 @@ def expand(points: Tensor) -> Tensor:
 
 
 class Background(nn.Module):
-    """Colour and density of a static, unbounded world, on three planes over contracted space.
+    """Colour and density of a static, unbounded background: three planes over contracted space.
 
     Args:
         channels: Channels of each plane.
         resolution: Texels along each side of the planes, which span the ball of radius 2.
         width: Neurons of the decoder's hidden layer.
-        samples: Samples of a ray behind the cube, before the one at infinity; 0 leaves that alone,
-            so that colour depends on direction only.
+        samples: Samples of a ray behind the cube, besides the one at infinity; with 0, colour
+            depends on direction only.
         precision: "bf16" multiplies in bfloat16.
-        colour: Initial colour, from 0 to 1; whatever the decoder's random weights show when None.
-            [3]
+        colour: Initial colour from 0 to 1; that of the decoder's random weights when None. [3]
     """
 
     def __init__(
@@ -103,5 +102,5 @@ class Background(nn.Module):
         Args:
             points: Contracted positions. [N, 3]
         """
-        places, still = points / RADIUS, torch.zeros_like(points[:, 0])
-        return self.decoder(plane_features(self.planes, None, places, still, ()).flatten(1))
+        places, times = points / RADIUS, torch.zeros_like(points[:, 0])
+        return self.decoder(plane_features(self.planes, None, places, times, ()).flatten(1))

@@ -10,15 +10,15 @@ from torch import Tensor, nn
 from xplanes.scenes.frame import Frame
 
 Writer = Callable[[Path, float, Frame], Path]
-"""Writes a field at one time from 0 to 1: takes a path without suffix, the time and the field's
-frame, and returns the path of the file."""
+"""Writes a field at one time to a file: takes a path without suffix, the time from 0 to 1 and the
+field's frame, and returns the path of the file."""
 
 
 class Representation(nn.Module, ABC):
     """Base class of trainable representations of a dynamic scene, such as radiance fields.
 
-    A representation lives in the cube [-1, 1]^3 of its frame. Subclasses override the properties
-    below where the defaults do not apply. Parameters and submodules must not use these names.
+    A representation covers the cube [-1, 1]^3 of its frame. Subclasses override the properties
+    below if the defaults do not apply. Parameters and submodules must not use these names.
 
     Raises:
         AttributeError: If a submodule is assigned to the name of a property.
@@ -46,11 +46,11 @@ class Representation(nn.Module, ABC):
 
     @property
     def exports(self) -> Mapping[str, Writer]:
-        """Files of its own that `xplanes export --what NAME` writes, by name."""
+        """Additional file formats by name, for `xplanes export --what NAME`."""
         return {}
 
     def cloud(self, time: float) -> tuple[Tensor, Tensor] | None:
-        """Points that stand for a field without a density, the most visible first.
+        """Points that represent a field without a density, the most visible first.
 
         Args:
             time: From 0 to 1.
@@ -61,15 +61,15 @@ class Representation(nn.Module, ABC):
         return None
 
     def masked(self, keep: Callable[[Tensor], Tensor]) -> Any:
-        """The same, empty in some places, for a renderer of this field.
+        """The field with some regions emptied, for its renderer.
 
         Args:
-            keep: Tells of points [N, 3] of the field's frame whether they are kept. bool [N]
+            keep: Maps points [N, 3] in the field's frame to whether they are kept. bool [N]
         """
         return Masked(self, keep)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        # torch would keep the part, and the property would go on hiding it.
+        # torch would accept the submodule, but the property would hide it.
         if isinstance(value, nn.Module) and isinstance(getattr(type(self), name, None), property):
             raise AttributeError(f"{type(self).__name__}.{name} is a property; rename the part")
         super().__setattr__(name, value)
@@ -89,7 +89,7 @@ class RadianceField(Representation):
     view_dependent = False
 
     def snapshot(self, time: float) -> "RadianceField":
-        """The field at one time, for images; this field itself where that saves nothing.
+        """The field at one time, for rendering; the field itself if that would not be faster.
 
         Args:
             time: From 0 to 1.
@@ -121,8 +121,8 @@ class ViewDependentField(RadianceField):
         Args:
             points: Positions in the field's frame. [N, 3]
             times: Times from 0 to 1. [N]
-            directions: Unit viewing directions in the field's frame; None looks along the third
-                axis, for callers that want the density alone. [N, 3]
+            directions: Unit viewing directions in the field's frame; None, for callers that need
+                only the density, stands for the third axis. [N, 3]
 
         Returns:
             Colour from 0 to 1 and density per unit length of the field's frame. [N, 3], [N]
@@ -134,7 +134,7 @@ class ViewDependentField(RadianceField):
 
 
 class SurfaceField(RadianceField):
-    """A field with a surface, where a signed distance is 0, in place of a density."""
+    """A field with a signed distance, zero on the surface, in place of a density."""
 
     @abstractmethod
     def signed_distance(self, points: Tensor, times: Tensor) -> Tensor:
@@ -146,11 +146,11 @@ class SurfaceField(RadianceField):
 
 
 class Masked:
-    """A field that is empty in some places; all else is the field's own.
+    """A field with some regions emptied; everything else is delegated to the field.
 
     Args:
-        field: Any field that a renderer takes.
-        keep: Tells of points [N, 3] which of them are not emptied. bool [N]
+        field: Any field that a renderer accepts.
+        keep: Maps points [N, 3] to whether they are kept. bool [N]
     """
 
     def __init__(self, field: Any, keep: Callable[[Tensor], Tensor]) -> None:

@@ -12,23 +12,23 @@ DensityActivation = Literal["softplus", "exp"]
 Precision = Literal["32", "bf16"]
 
 MOST_EXPONENT = 60.0
-"""Logits beyond it give the density of this one: an infinite density has gradients that are NaN."""
+"""Larger logits are clamped to this: the gradients of an infinite density would be NaN."""
 
 _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"relu": torch.relu_, "silu": F.silu}
 
 
 ROWS = 256
-"""On the CPU the rows of products are padded to a multiple of this; to a larger one for many rows.
+"""On the CPU, matrices are padded to a multiple of this many rows; of more if they are long.
 
-There each number of rows has a kernel that is compiled at its first use and kept, and every batch
-has another number of samples.
+oneDNN compiles and caches one kernel per number of rows, and every batch has a different number of
+samples.
 """
 
 
 def half_rows(values: Tensor) -> Tensor:
-    """The values in bfloat16, on the CPU with rows of zeros below. [N, C] -> [at least N, C]
+    """The values in bfloat16, on the CPU padded with rows of zeros. [N, C] -> [at least N, C]
 
-    Those are fewer than `ROWS` or than a sixteenth of the values.
+    The padding is less than `ROWS` rows, or than a sixteenth of the values.
     """
     values = values.to(torch.bfloat16)
     if values.device.type != "cpu":
@@ -38,7 +38,7 @@ def half_rows(values: Tensor) -> Tensor:
 
 
 class Decoder(nn.Module):
-    """Features of three planes to colour and density, in the shape that public LRMs share.
+    """Features of three planes to colour and density, with the architecture of public LRMs.
 
     Channel 0 of the last layer is the density's logit, channels 1 to 3 are the colour's. Density is
     ``scale * softplus(logit - 1)`` (OpenLRM) or ``scale * exp(logit - 1)`` (TripoSR), per unit
@@ -51,8 +51,8 @@ class Decoder(nn.Module):
         activation: Between layers.
         density: Activation of the density.
         density_scale: Factor on the density.
-        precision: "bf16" multiplies in bfloat16 and keeps all else in float32.
-        colour_margin: Widens the sigmoid of the colour by this much on either side of [0, 1].
+        precision: "bf16" multiplies in bfloat16 and computes everything else in float32.
+        colour_margin: Extends the colour's range beyond [0, 1] by this on either side.
 
     Source: X-Planes, Eq. 14; OpenLRM 1.1; TripoSR.
     """
@@ -82,7 +82,7 @@ class Decoder(nn.Module):
 
     @property
     def options(self) -> dict[str, Any]:
-        """What its weights need to mean anything: arguments but for channels and precision."""
+        """Arguments that its weights depend on: all except channels and precision."""
         return {
             "width": self.width,
             "hidden": self.hidden,

@@ -1,11 +1,11 @@
 """Reading feature planes at points, and writing gradients back.
 
-A plane is stored channels-last, [H, W, C]: the C numbers of a texel lie side by side, so one read
-of memory brings them all. Plane "ab" has axis a along its columns and axis b along its rows.
+A plane is stored channels-last, [H, W, C]: the C numbers of a texel are contiguous, so that one
+memory access reads them all. Plane "ab" has axis a along its columns and axis b along its rows.
 
-Space axes follow the LRMs' convention: coordinates from -1 to 1 run over the whole texels
-(``align_corners=False``) and beyond the border there is zero. The time axis runs from the first row
-(t = 0) to the last (t = 1), so that with as many rows as frames each frame owns one.
+Space axes follow the LRMs' convention: coordinates from -1 to 1 span whole texels
+(``align_corners=False``), and planes are zero outside. The time axis runs from the centre of the
+first row (t = 0) to that of the last (t = 1): with as many rows as frames, each frame has its own.
 """
 
 import functools
@@ -40,15 +40,15 @@ def plane_features(
 ) -> Tensor:
     """Features of Eq. 15: each space plane plus the product of its two time planes.
 
-    Gradients reach the planes only. On the CPU compiled loops do the work, on CUDA Triton kernels
-    where they prove themselves, elsewhere `plane_features_reference`.
+    Gradients reach the planes only. Computed by compiled loops on the CPU, by Triton kernels on
+    CUDA if they pass their trial, and otherwise by `plane_features_reference`.
 
     Args:
         space: Planes xy, xz, yz. [3, H, H, C]
-        time: Space-time planes, rows are time; None for a static scene. [P, T, H', C]
+        time: Space-time planes, with time along the rows; None for a static scene. [P, T, H', C]
         points: Positions in the field's frame. [N, 3]
         times: Times from 0 to 1. [N]
-        rows: For each space plane, the two time planes multiplied.
+        rows: For each space plane, the two time planes that are multiplied.
 
     Returns:
         One feature vector per space plane. [N, 3, C]
@@ -65,16 +65,16 @@ def plane_features(
 
 
 def add_plane_features(features: Tensor, space: Tensor, points: Tensor) -> Tensor:
-    """Features plus those of space planes with fewer channels, which go to the first ones.
+    """Add features of space planes with fewer channels to the first channels.
 
     Args:
-        features: On the CPU they are overwritten; an operation that saved them for its gradient
-            cannot come before. [N, 3, C]
+        features: Overwritten on the CPU, so that no earlier operation may have saved them for its
+            gradient. [N, 3, C]
         space: Planes xy, xz, yz, C' <= C. [3, H, H, C']
         points: Positions in the field's frame. [N, 3]
 
     Returns:
-        Gradients reach both. [N, 3, C]
+        The sum; gradients reach both terms. [N, 3, C]
     """
     if cpu_loops(space) and features.dtype == space.dtype:
         return _Onto.apply(features, space, points)  # type: ignore[return-value]
@@ -85,8 +85,8 @@ def add_plane_features(features: Tensor, space: Tensor, points: Tensor) -> Tenso
 def plane_features_reference(
     space: Tensor, time: Tensor | None, points: Tensor, times: Tensor, rows: Rows
 ) -> Tensor:
-    """The same as `plane_features`, written for reading: one ``grid_sample`` per plane."""
-    # Beyond 2 nothing is left of any plane; infinities would make NaNs out of that nothing.
+    """Reference implementation of `plane_features`: one ``grid_sample`` per plane."""
+    # Planes are zero beyond 2; clamping avoids the NaNs that infinite coordinates would give.
     points, times = points.to(space.dtype).clamp(-4, 4), times.to(space.dtype)
 
     def sample(plane: Tensor, columns: Tensor, line: Tensor) -> Tensor:
@@ -109,9 +109,9 @@ def plane_features_reference(
 def plane_features_gpu(
     space: Tensor, time: Tensor | None, points: Tensor, times: Tensor, rows: Rows
 ) -> Tensor:
-    """The same as `plane_features`, in Triton kernels: one for the values, one for the gradients.
+    """`plane_features` in Triton: one kernel for the values, one for the gradients.
 
-    Planes of half precision are read and added up in float32.
+    Planes of half precision are interpolated and accumulated in float32.
     """
     return _Kernels.apply(space, time, points, times, rows)  # type: ignore[return-value]
 
@@ -155,7 +155,7 @@ class _Features(torch.autograd.Function):
 
 
 class _Onto(torch.autograd.Function):
-    """Autograd's own addition to a slice would copy the gradient of all channels twice."""
+    """Adds to the first channels; autograd's own slices would copy the whole gradient twice."""
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, space: Tensor, points: Tensor) -> Tensor:
@@ -224,7 +224,7 @@ class _Kernels(torch.autograd.Function):
 
 @functools.cache
 def _kernels_hold(device: torch.device, dtype: torch.dtype, channels: int, rows: Rows) -> bool:
-    """Whether the kernels prove themselves for such planes, gradients included."""
+    """Whether the kernels pass their trial for such planes, gradients included."""
 
     def attempt(function: Callable[..., Tensor], precision: torch.dtype) -> list[Tensor]:
         stacks = [waves(device, 3, 5, 5, channels)]

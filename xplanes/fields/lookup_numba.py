@@ -1,7 +1,7 @@
-"""Compiled loops for reading planes on the CPU; `lookup` holds the readable twin.
+"""Compiled loops for reading planes on the CPU; the reference implementation is in `lookup`.
 
-Nothing but the planes, the points and the result touches memory: indices and weights live in
-registers. Imported only when needed, since numba takes a second to load.
+Indices and weights stay in registers: only planes, points and results are in memory. Imported only
+when needed, since numba takes a second to load.
 """
 
 # ruff: noqa: D103 (the callers in lookup.py document these loops)
@@ -15,7 +15,7 @@ COMPILE = {"nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
 
 
 def tasks_a_plane(planes):
-    """Tasks that share the rows of each plane: a power of 2, so that each thread has one."""
+    """Tasks per plane, which share its rows: a power of 2 that gives every thread a task."""
     return 1 << ((get_num_threads() - 1) // planes).bit_length()
 
 
@@ -23,7 +23,7 @@ def tasks_a_plane(planes):
 def space_taps(value, size):
     half = type(value)(0.5)
     position = value * type(value)(size) * half + (type(value)(size) * half - half)
-    # A NaN or a huge value must not become an index; its weight still carries it on.
+    # A NaN or a huge value must not become an index; it still propagates through the weight.
     safe = position if position > -1 else type(value)(-1)
     safe = safe if safe < size else type(value)(size)
     floor = np.floor(safe)
@@ -43,7 +43,7 @@ def time_taps(value, size):
     safe = position if position > 0 else type(value)(0)
     safe = safe if safe < size - 1 else type(value)(size - 1)
     lower = max(min(np.int64(safe), size - 2), 0)
-    # A NaN passes no comparison above: it must still show in the result.
+    # A NaN fails the comparisons above, but must appear in the result.
     fraction = safe - type(value)(lower) if position == position else position
     return lower, min(lower + 1, size - 1), type(value)(1) - fraction, fraction
 
@@ -117,11 +117,11 @@ def add_to_space(points, gradient, plane, own, tasks, space):
 
 @njit(parallel=True, **COMPILE)
 def scatter_space(points, gradient, tasks, space):
-    """One task owns every n-th row of one plane, so that no two write to one place.
+    """Each task owns every n-th row of a plane, so that no two tasks write to the same texel.
 
-    A row takes the points in their order, whatever the number of tasks: the sums are the same.
+    Each row adds the points in order, so that sums do not depend on the number of tasks.
     """
-    if tasks == 1:  # Compiled apart, for this is a tenth faster where rows need no owner.
+    if tasks == 1:  # Compiled separately: a tenth faster without the test of a row's owner.
         for plane in prange(3):
             add_to_space(points, gradient, plane, 0, 1, space)
     else:
@@ -142,7 +142,7 @@ def product_gradients(rows, gradient, factors, spread):
 
 @njit(parallel=True, **COMPILE)
 def scatter_time(points, times, axes, gradient, tasks, time):
-    """As `scatter_space`, for planes of time."""
+    """As `scatter_space`, for time planes."""
     for task in prange(time.shape[0] * tasks):
         plane, own = task // tasks, task % tasks
         target, axis = time[plane], axes[plane]

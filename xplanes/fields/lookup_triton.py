@@ -1,9 +1,9 @@
-"""Triton kernels for reading planes on CUDA; `lookup` holds the readable twin.
+"""Triton kernels for reading planes on CUDA; the reference implementation is in `lookup`.
 
-A program takes a block of points and up to 128 channels. The channels of a texel lie side by side,
-so neighbouring threads read neighbouring numbers; indices, weights and factors live in registers,
-and the backward reads the factors again instead of fetching saved ones from far away. Imported only
-when needed, since triton takes a while to load.
+A program handles a block of points and up to 128 channels. The channels of a texel are contiguous,
+so that reads are coalesced. Indices, weights and factors stay in registers; the backward pass
+interpolates the factors again, which is faster than reading saved ones. Imported only when needed,
+since triton takes a while to load.
 """
 
 # ruff: noqa: D103 (the callers in lookup.py document these kernels)
@@ -13,25 +13,25 @@ import triton
 import triton.language as tl
 
 WIDE_TILE, NARROW_TILE = 512, 128
-"""Points times channels of a program: four numbers to a thread where they can be moved as one, else
-one. With more the backward runs out of registers."""
+"""Points times channels of a program: four numbers per thread if they can be moved as one, else
+one. With more, the backward pass runs out of registers."""
 
 WIDEST = 128
-"""Channels of a program at most; the second axis of the grid takes the others."""
+"""Most channels of a program; the rest are spread along the second axis of the grid."""
 
 SIZES = ["count", "size", "timesteps", "width"]
-"""Numbers that make no variants of a kernel, so that one trial covers all resolutions."""
+"""Arguments for which triton compiles no variants, so that one trial covers all resolutions."""
 
 OUTSIDE = tl.constexpr(3.0)
-"""Coordinate of the points that fill up the last block: beyond all planes, where weights are zero
-and nothing is read or written."""
+"""Coordinate of the points that pad the last block: outside all planes, where weights are zero and
+nothing is read or written."""
 
 
 @triton.jit
 def space_taps(value, size):
     """Two neighbouring texels and their weights."""
     position = value * (size * 0.5) + (size * 0.5 - 0.5)
-    # A NaN or a huge value must not become an index; its weight still carries it on.
+    # A NaN or a huge value must not become an index; it still propagates through the weight.
     safe = tl.where(position > -1, position, -1.0)
     safe = tl.where(safe < size, safe, size)
     floor = tl.floor(safe)
@@ -45,12 +45,12 @@ def space_taps(value, size):
 
 @triton.jit
 def time_taps(value, size):
-    """Two neighbouring rows and their weights; before the first and after the last stands one."""
+    """Two neighbouring rows and their weights; times outside [0, 1] use the first or last row."""
     position = value * (size - 1)
     safe = tl.where(position > 0, position, 0.0)
     safe = tl.where(safe < size - 1, safe, size - 1)
     lower = tl.maximum(tl.minimum(safe.to(tl.int32), size - 2), 0)
-    # A NaN passes no comparison above: it must still show in the result.
+    # A NaN fails the comparisons above, but must appear in the result.
     fraction = tl.where(position == position, safe - lower, position)
     return lower, tl.minimum(lower + 1, size - 1), 1 - fraction, fraction
 
@@ -64,14 +64,14 @@ def corner(first_row, width, row, column, LINE: tl.constexpr, SIDE: tl.constexpr
 @triton.jit
 def reach(texel, weight, channel, CHANNELS: tl.constexpr):
     """Offsets and mask of a texel's channels. [points, channels]"""
-    # A plane may hold more than 2^31 numbers, though never more texels than that.
+    # A plane may have more than 2^31 numbers, though never that many texels.
     offset = texel.to(tl.int64)[:, None] * CHANNELS + channel[None, :]
     return offset, (weight != 0)[:, None] & (channel < CHANNELS)[None, :]
 
 
 @triton.jit
 def read(planes, first_row, width, row, column, channel, CHANNELS: tl.constexpr):
-    """What a plane holds, between its texels. [points, channels]"""
+    """Bilinear interpolation in a plane. [points, channels]"""
     value = tl.zeros([row[2].shape[0], channel.shape[0]], row[2].dtype)
     for i in tl.static_range(2):
         for j in tl.static_range(2):
@@ -84,7 +84,7 @@ def read(planes, first_row, width, row, column, channel, CHANNELS: tl.constexpr)
 
 @triton.jit
 def spread(planes, first_row, width, row, column, source, channel, CHANNELS: tl.constexpr):
-    """Adds to a plane's gradient what `read` took from where."""
+    """Adds the gradient of `read` to that of the plane."""
     for i in tl.static_range(2):
         for j in tl.static_range(2):
             texel, weight = corner(first_row, width, row, column, i, j)
@@ -106,7 +106,7 @@ def coordinates(points, n, count):
 def read_factors(
     time, timesteps, width, line, places, channel, AXES: tl.constexpr, CHANNELS: tl.constexpr
 ):
-    """What the time planes hold, one after the other."""
+    """Interpolated values of all time planes."""
     found = ()
     for plane in tl.static_range(len(AXES)):
         value = read(time, plane * timesteps, width, line, places[AXES[plane]], channel, CHANNELS)
@@ -203,8 +203,8 @@ def backward_by_row(
     POINTS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    # Six time planes in one program are more than the registers hold. No two rows share one, so
-    # that each program takes a row: the third axis of the grid.
+    # Six time planes in one program would not fit the registers. No two rows share a time plane, so
+    # that each program handles one row, along the third axis of the grid.
     n = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
     channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     x, y, z = coordinates(points, n, count)
@@ -268,7 +268,7 @@ def backward(
         places = space_taps(x, width), space_taps(y, width), space_taps(z, width)
         factor = read_factors(time, timesteps, width, line, places, channel, AXES, CHANNELS)
         for plane in tl.static_range(len(AXES)):
-            # A plane that two rows share is written once, with the sum of both.
+            # A plane that two rows share is written once, with the sum of both gradients.
             source = tl.zeros_like(xy)
             for r in tl.static_range(3):
                 if ROWS[r][0] == plane:
@@ -293,14 +293,14 @@ def gather(space, time, points, times, rows, axes, features):
     """Launches `forward`; ``features`` [N, 3, C] are written."""
     grid, blocks = tiles(len(points), space.shape[3])
     sizes = (len(points), space.shape[1], *(time.shape[1:3] if axes else (1, 1)))
-    # A kernel that reads no time is handed any pointer.
+    # A kernel without time planes still needs a pointer.
     tensors = space, time if axes else space, points, times, features
     with torch.cuda.device_of(space):
         forward[grid](*tensors, *sizes, ROWS=rows, AXES=axes, **blocks)
 
 
 def scatter(size, time, points, times, rows, axes, gradient, space_gradient, time_gradient):
-    """Launches `backward`, or `backward_by_row`; gradients that are not None are added to."""
+    """Launches `backward` or `backward_by_row`, which add to the gradients that are not None."""
     grid, blocks = tiles(len(points), gradient.shape[2])
     moving = axes if time_gradient is not None else ()
     by_row = len(moving) == 2 * len(rows)

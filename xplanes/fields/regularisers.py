@@ -1,8 +1,8 @@
-"""Smoothness of planes, as gradients written straight into ``.grad``.
+"""Smoothness of planes, as gradients added directly to ``.grad``.
 
-The loss of a step is a handful of rays, that of the planes' smoothness is every texel: through
-autograd it would cost more than all else. Its gradient is a stencil, so it is added directly, every
-few steps with as many times the weight.
+A training step renders few rays, but smoothness involves every texel: through autograd it would
+cost more than the rest of the step. Its gradient is a simple stencil, which is added every few
+steps, with a correspondingly larger weight.
 """
 
 import torch

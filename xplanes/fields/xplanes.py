@@ -15,10 +15,10 @@ PLANE_SETS: dict[str, Rows] = {
     "six": ((0, 1), (0, 2), (1, 2)),
     "nine": ((0, 1), (2, 3), (4, 5)),
 }
-"""Which two time planes each of xy, xz, yz multiplies.
+"""For each of xy, xz, yz: the two time planes whose product is added.
 
-six: xt, yt, zt, each shared by two rows. nine: xt, yt | xt', zt | yt', zt'. three: none, a static
-scene.
+six: xt, yt, zt, each shared by two space planes. nine: xt, yt | xt', zt | yt', zt'. three: none,
+for a static scene.
 """
 
 SPACE_PLANES = ("xy", "xz", "yz")
@@ -35,8 +35,8 @@ TIME_PLANES: dict[str, tuple[str, ...]] = {
 class XPlanes(RadianceField):
     """A dynamic radiance field: products of space-time planes are added to space planes.
 
-    The field lives in the cube [-1, 1]^3. The planes are zero outside it, and renderers take no
-    samples of the field there.
+    The field covers the cube [-1, 1]^3. Outside it the planes are zero, and renderers take no
+    samples.
 
     Args:
         planes: Initial values by name: space planes xy, xz, yz [C, H, H] and the plane set's time
@@ -45,7 +45,7 @@ class XPlanes(RadianceField):
             they are added to the first C' channels of the space planes' features.
         decoder: Maps features [N, 3 C] to colour [N, 3] and density [N].
         plane_set: "six" (as in K-Planes), "nine" (as in Tensor4D) or "three" (no time planes).
-        background: Model of what lies behind the cube; None for the renderer's plain colour.
+        background: Model of the background outside the cube; None: the renderer's constant colour.
 
     Raises:
         ValueError: If the plane set is unknown, a plane is missing or superfluous, or shapes
@@ -78,7 +78,7 @@ class XPlanes(RadianceField):
         fine = FINE_PLANES[0] in planes
         self.fine = nn.Parameter(_stack(planes, FINE_PLANES)) if fine else None
         self.is_fine = True
-        """Whether fine planes are read; not needed while they are zero."""
+        """Whether fine planes are read; False saves time while they are zero."""
         if self.space.shape[1] != self.space.shape[2]:
             raise ValueError(f"space planes are {list(planes['xy'].shape)}: must be [C, H, H]")
         if self.time is not None and self.time.shape[3] != self.space.shape[3]:
@@ -128,19 +128,19 @@ class XPlanes(RadianceField):
     def snapshot(self, time: float) -> RadianceField:
         """The field at one time as three space planes, equal up to rounding and faster to read.
 
-        The product of two lines, each linear between its texels, is what a plane of the products of
-        their texels shows.
+        At a fixed time each time plane is a line. The outer product of two lines is a plane whose
+        bilinear interpolation equals the product of the two linear ones.
 
         Args:
             time: From 0 to 1.
 
         Returns:
-            A copy of the planes; this field if it does not move, if its time planes have another
-            resolution than its space planes, or if it is of a class derived from this one.
+            A field with static planes; this field if it does not move, if its time planes have
+            another resolution than its space planes, or if its class is derived from this one.
         """
         if self.time is None or self.time.shape[2] != self.space.shape[2]:
             return self
-        if type(self) is not XPlanes:  # It may show something else.
+        if type(self) is not XPlanes:  # A derived class may override how planes are combined.
             return self
         rows = self.time.shape[1]
         place = min(max(time, 0.0), 1.0) * (rows - 1)
@@ -159,7 +159,7 @@ class XPlanes(RadianceField):
         )
 
     def features(self, points: Tensor, times: Tensor) -> Tensor:
-        """Features that the decoder sees. [N, 3], [N] -> [N, 3 C]"""
+        """Input of the decoder. [N, 3], [N] -> [N, 3 C]"""
         found = plane_features(self.space, self.time, points, times, self.rows)
         if self.fine is not None and self.is_fine:
             found = add_plane_features(found, self.fine, points)

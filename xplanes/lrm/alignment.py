@@ -19,7 +19,7 @@ from xplanes.lrm.images import Crop, square_crop
 from xplanes.scenes.frame import Frame
 
 MOST = 2.0
-"""Largest factor by which a cube grows: the model predicts nothing far outside its own cube."""
+"""Largest growth factor of a cube: the model predicts nothing far outside its own cube."""
 
 
 def fit_cube(triplanes: Tensor, half_side: float, wanted: float) -> tuple[Tensor, float]:
@@ -75,7 +75,7 @@ class Alignment:
     """Alignment of the model's frame with the world.
 
     Attributes:
-        frame: From the world to the model's frame.
+        frame: Map from the world to the model's frame.
         half_side: Half the side of the model's cube, in its frame; the field is empty outside.
         crop: Square of the source image that is the model's input.
         mismatch: Remaining error of the similarity.

@@ -1,4 +1,4 @@
-"""The canonical camera of a Large Reconstruction Model: the one that it assumes for its input."""
+"""The canonical camera of a Large Reconstruction Model, which it assumes for its input."""
 
 import math
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ class CanonicalView:
     """A model's canonical camera and box. Camera axes are OpenGL's: x right, y up, view along -z.
 
     Attributes:
-        rotation: From camera axes to the model's frame. 3 rows of 3
-        distance: From the camera to the centre of the box, in units of the model's frame.
+        rotation: Rotation from camera axes to the model's frame. 3 rows of 3
+        distance: Distance from the camera to the centre of the box, in the model's frame.
         focal: Focal length as a share of the image's width.
         half_side: Half the side of the cube of the model's field.
         background: Grey value, from 0 to 1, behind the object in the model's input.

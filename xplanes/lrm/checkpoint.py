@@ -76,7 +76,7 @@ def load(config: Mapping[str, Any] | LRMConfig, weights: Path) -> LRM:
 
 
 def build(config: LRMConfig) -> LRM:
-    """A model on the meta device: shapes without memory."""
+    """A model on the meta device, which allocates no memory."""
     with torch.device("meta"):
         model = TripoSR(config) if config.architecture == "triposr" else OpenLRM(config)
     return model.eval().requires_grad_(False)
@@ -107,7 +107,7 @@ def fill(model: LRM, state: Mapping[str, Tensor]) -> None:
 
 
 def _finite(values: Tensor) -> bool:
-    """Whether all numbers are finite; without a copy of them."""
+    """Whether all numbers are finite, computed without a copy."""
     return not values.is_floating_point() or bool(values.sum(dtype=torch.float64).isfinite())
 
 
@@ -169,17 +169,17 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def _content(path: Path) -> Any:
-    """What a file of weights holds.
+    """Content of a file of weights.
 
     Raises:
-        LRMError: If it is damaged, or holds code.
+        LRMError: If it is damaged, or contains code.
     """
     try:
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
 
             return load_file(path)
-        # Only files of newer versions of torch, which are archives, can be mapped.
+        # Only files of newer versions of torch, which are zip archives, can be memory-mapped.
         mapped = zipfile.is_zipfile(path)
         return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except pickle.UnpicklingError as problem:
@@ -187,7 +187,7 @@ def _content(path: Path) -> Any:
             f"{path} is not a file of weights, or contains code, which is never run: use the "
             f".safetensors file if there is one"
         ) from problem
-    except Exception as problem:  # Files that are no weights fail in many ways.
+    except Exception as problem:  # Other files raise many kinds of errors.
         raise LRMError(f"{path} is damaged or incomplete: {problem}") from problem
 
 

@@ -13,7 +13,7 @@ class Published(NamedTuple):
     """A published model.
 
     Attributes:
-        config: Its own configuration, as its authors publish it.
+        config: Its configuration, as published by its authors.
         choice: The setting that selects it.
     """
 

@@ -55,7 +55,7 @@ class Crop:
 def square_crop(height: int, width: int, zoom: float = 1.0) -> Crop:
     """The smallest centred square around an image, its side divided by ``zoom``.
 
-    Margins are whole numbers of pixels and equal on opposite sides, so that the centre stays.
+    Margins are whole pixels and equal on opposite sides, so that the centre is preserved.
     """
     side = max(height, width)
     side += 2 * round(0.5 * side * (1 / zoom - 1))

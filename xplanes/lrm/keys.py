@@ -1,9 +1,9 @@
 """Names of tensors in published checkpoints, and their names in this package.
 
-In a name, ``{i}`` stands for the number of a layer, ``{p}`` for weight or bias, and ``{e}`` for the
-even number of a linear layer with activations between: its half (``{h}``) counts the layers.
-A tensor with several names here contains them stacked along its first axis. None marks tensors that
-a checkpoint may contain and that are not needed.
+In a name, ``{i}`` is the index of a layer and ``{p}`` is weight or bias. ``{e}`` is the even index
+of a linear layer in a sequence that alternates with activations, and ``{h}`` is half of it. A
+published tensor with several names here is their concatenation along the first axis. None marks
+tensors that a checkpoint may contain but the model does not need.
 """
 
 import re
@@ -120,7 +120,7 @@ NAMES: dict[Architecture, Names] = {
     },
     "triposr": {**_dino("image_tokenizer.model"), **_TRIPOSR},
 }
-"""Published name to ours, by family."""
+"""Maps published names to those of this package, by family."""
 
 _PLACEHOLDERS = {"i": r"\d+", "e": r"\d*[02468]", "p": r"weight|bias"}
 
@@ -139,7 +139,7 @@ def translate(architecture: Architecture, name: str) -> tuple[str, ...] | None:
 
 @cache
 def _patterns(architecture: Architecture) -> list[tuple[re.Pattern[str], Any]]:
-    """A regular expression for each published name of a family, and our names."""
+    """For each published name of a family, a regular expression and the names in this package."""
     found = []
     for name, ours in NAMES[architecture].items():
         parts = re.split(r"\{(\w)\}", name)

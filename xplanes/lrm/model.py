@@ -22,8 +22,8 @@ class LRM(nn.Module):
         **decoder: Options of the decoder beyond its size.
 
     Attributes:
-        config: As given.
-        view: As given.
+        config: Sizes of the model.
+        view: The model's canonical camera and bounding cube.
         decoder: Maps features [N, 3 C] to colour [N, 3] and density per unit length of the model's
             frame [N].
         encoder: The image encoder.

@@ -121,7 +121,7 @@ def turn_third_plane(planes: Tensor) -> Tensor:
         planes: Planes xy, xz, zy or xy, xz, yz. [..., 3, C, H, H]
 
     Returns:
-        The same with the third plane transposed. [..., 3, C, H, H]
+        Planes with the third one transposed. [..., 3, C, H, H]
     """
     xy, xz, third = planes.unbind(-4)
     return torch.stack([xy, xz, third.transpose(-2, -1)], dim=-4)

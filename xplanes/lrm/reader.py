@@ -16,7 +16,7 @@ class Reader:
     Attributes:
         values: The section read from.
         place: Key path of the section, for messages.
-        root: The whole configuration, for references; ``values`` if empty.
+        root: The whole configuration, for resolving references; ``values`` if empty.
     """
 
     values: Mapping[str, Any]
@@ -68,7 +68,7 @@ class Reader:
         return LRMError(f"the model's configuration has {self.place}{key}={value!r}: {wanted}")
 
     def _value(self, key: str, default: Any) -> Any:
-        """A value, with references ``${a.b}`` followed, as TripoSR's YAML uses them."""
+        """A value, with references ``${a.b}``, as in TripoSR's YAML, resolved."""
         value = self.values.get(key, default)
         for _ in range(8):
             match = re.fullmatch(r"\$\{([\w.]+)\}", value) if isinstance(value, str) else None

@@ -10,8 +10,8 @@ from xplanes.lrm.config import EncoderConfig
 def attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
     """Scaled dot-product attention. [N, H, T, E], [N, H, K, E], [N, H, K, E] -> [N, H, T, E]
 
-    In bfloat16 on the CPU, separate matrix products, one sequence at a time so that its scores stay
-    in the cache, take a third of the fused kernel's time (768 tokens, 2 heads of 64 channels).
+    In bfloat16 on the CPU, separate matrix products take a third of the fused kernel's time (768
+    tokens, 2 heads of 64 channels). They process one sequence at a time, which fits in the cache.
     """
     if query.device.type != "cpu" or query.dtype != torch.bfloat16:
         return F.scaled_dot_product_attention(query, key, value)

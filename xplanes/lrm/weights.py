@@ -27,7 +27,7 @@ PATIENCE_SECONDS = 0.8
 def answers(url: str) -> bool:
     """Whether a server, or the environment's proxy to it, accepts a connection in time.
 
-    The hub's own client retries for half a minute.
+    Asked first because the hub's own client retries for half a minute.
 
     Args:
         url: Address of the server, http or https.
@@ -56,7 +56,7 @@ CONFIG_FILES = ("config.json", "config.yaml")
 
 @dataclass(frozen=True, kw_only=True)
 class WeightSource(Settings):
-    """Where the weights of a published model come from: the Hugging Face hub, or a local file."""
+    """Source of a published model's weights: the Hugging Face hub, or a local file."""
 
     architecture: str  # One of openlrm-{small,base,large}-{1.0,1.1} and triposr.
     repository: str  # Repository on the Hugging Face hub.
@@ -90,7 +90,7 @@ def load_weights(
         return load({"architecture": source.architecture}, path)
     except MismatchError as problem:
         beside = [path.parent / name for name in CONFIG_FILES if (path.parent / name).is_file()]
-        # A published model of another size is an error, even if a configuration exists.
+        # Weights of another published model are an error, even if a configuration exists.
         if problem.fits or not beside or source.weights is None:
             raise
         announce(f"{path} has other sizes than published: using {beside[0]}")

@@ -1,4 +1,4 @@
-"""The background behind a field: its settings, learning rates and smoothness, for any model."""
+"""The learnt background behind a field: settings, learning rates and smoothness, for any model."""
 
 from dataclasses import dataclass
 
@@ -17,11 +17,11 @@ from xplanes.settings import Count, Positive, Settings, Steps, Weight
 from xplanes.streams import Stream, TrainingState, initial_values
 
 MOST_IMAGES, PIXEL_STEP = 32, 4
-"""Images that tell the usual colour, and every which row and column of them."""
+"""Largest number of images for `usual_colour`, and stride between their rows and columns."""
 
 
 def usual_colour(views: Views) -> Tensor:
-    """Median of the images' colours, by channel, from 0 to 1. [3]"""
+    """Median colour of the images, per channel, from 0 to 1. [3]"""
     steps = slice(None, None, PIXEL_STEP)
     chosen = spread(MOST_IMAGES, len(views))
     pixels = torch.cat([views.image(i)[steps, steps, :3].reshape(-1, 3) for i in chosen])
@@ -29,11 +29,11 @@ def usual_colour(views: Views) -> Tensor:
 
 
 UNSEEN_RAYS, UNSEEN_EVERY = 64, 8
-"""Random rays of the prior on what no view shows, and the steps from one time to the next."""
+"""Random rays of the prior on unseen directions, and steps between its evaluations."""
 
 
 def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
-    """The value of each column below which half of the weight lies. [N, C], [N] -> [C]"""
+    """Weighted median of each column. [N, C], [N] -> [C]"""
     values, order = values.sort(dim=0)
     share = weights[order].cumsum(dim=0)
     middle = (share < 0.5 * share[-1]).sum(dim=0).clamp_max(len(values) - 1)
@@ -49,8 +49,8 @@ class BackgroundSettings(Settings):
     samples: Steps  # Samples per ray behind the field; 0: colour depends on direction only.
     width: Count  # Neurons of the decoder's hidden layer.
     total_variation: Weight  # Weight of its planes' total variation.
-    # Weight of the squared error of random rays' colours against the usual colour of what views
-    # see behind the cube, which directions that no view shows then have.
+    # Weight of the prior on directions that no view shows: squared error of random rays' colours
+    # against the median colour that views show behind the cube.
     unseen: Weight
     plane_lr: Positive  # Learning rate of its planes.
     decoder_lr: Positive  # Learning rate of its decoder.
@@ -80,10 +80,10 @@ class BackgroundSettings(Settings):
     def losses(
         self, background: Background, rendering: Rendering, rays: Batch, state: TrainingState
     ) -> dict[str, Tensor]:
-        """Loss terms of the background by name, at steps at which there are any. [] each
+        """Loss terms of the background by name; empty between evaluations of the prior. [] each
 
-        The decoder learns from all views; without the prior it shows anything in directions that no
-        view shows.
+        The decoder is shared by all directions: without the prior, those that no view shows would
+        get arbitrary colours.
 
         Args:
             background: The background.
@@ -102,7 +102,7 @@ class BackgroundSettings(Settings):
         return {"unseen": UNSEEN_EVERY * self.unseen * error.square().mean()}
 
     def regularise(self, background: Background, every: int = 1) -> None:
-        """Add the gradient of its total variation, as much as for ``every`` steps."""
+        """Add the gradient of its total variation, scaled by ``every`` steps."""
         planes = background.planes
         if planes.grad is not None and self.total_variation:
             weight = self.total_variation * every

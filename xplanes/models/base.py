@@ -23,11 +23,11 @@ from xplanes.streams import TrainingState
 class InitialValues:
     """Initial values of a field that is not initialised randomly.
 
-    Models that take something else than planes derive a class from this one.
+    Models that are not initialised with planes derive their own class.
 
     Attributes:
         planes: Planes by name. [C, rows, columns] each
-        decoder: Weights of the decoder; None for a fresh one.
+        decoder: Weights of the decoder; None for random ones.
         sparse: Target of the regulariser L_r for the time planes; None disables L_r.
             [T, 3, C, H, H]
     """
@@ -55,8 +55,8 @@ class Model(ABC):
     def groups(self) -> list[Group]:
         """Parameter groups of the field, each with ``params``, ``lr`` (peak) and ``name``.
 
-        Names must be unique, also among the sampler's groups. A group may hold further arguments of
-        the optimiser.
+        Names must be unique, also among the sampler's groups. A group may contain further arguments
+        of the optimiser.
         """
 
     def optimizer(self, groups: list[Group]) -> torch.optim.Optimizer:
@@ -69,11 +69,11 @@ class Model(ABC):
 
     @abstractmethod
     def rate(self, step: int, progress: float) -> float:
-        """Factor on all learning rates.
+        """Common factor on the learning rates.
 
         Args:
             step: Number of optimiser steps done.
-            progress: Share of the training budget that is spent, from 0 to 1.
+            progress: Share of the training budget that has been used, from 0 to 1.
         """
 
     def rate_of(self, group: str, step: int, progress: float) -> float:
@@ -109,7 +109,7 @@ class Model(ABC):
 
         Args:
             state: Seed and progress of training.
-            optimizer: The optimiser; its state must match parameters that are replaced.
+            optimizer: The optimiser; if parameters are replaced, its state must be, too.
         """
         return
 
@@ -121,7 +121,7 @@ class Model(ABC):
     def sparse(self) -> Tensor | None:
         """The sparse part of the initial values, while a loss term needs it. [T, 3, C, H, H]
 
-        The model alone holds it, so that it is freed in time.
+        Only the model keeps a reference, so that the memory can be freed.
         """
         return None
 
@@ -131,7 +131,7 @@ class ModelSettings(Settings, ABC):
     """Base class of the settings of models."""
 
     takes: ClassVar[str | None] = None
-    """Kind of initialisation that the field accepts, such as "planes"; None if only random."""
+    """Kind of initialisation that the field accepts, such as "planes"; None: only random."""
     devices: ClassVar[int | None] = 1
     """Maximum number of devices for training; None for no limit."""
     field_class: ClassVar[type[Representation] | None] = None
@@ -188,19 +188,19 @@ class ModelSettings(Settings, ABC):
     def for_scene(
         self, views: Views, half_side: float | None, points: Tensor | None = None
     ) -> "ModelSettings":
-        """The same with the scene's cube, near and far where published ones do not fit the scene.
+        """The settings with cube, near and far from the scene, where published ones do not fit it.
 
-        Unchanged by default, for models whose field and sampler take them from the scene anyway.
+        Unchanged by default, for models whose field and sampler take them from the scene.
 
         Args:
             views: Training views.
-            half_side: As for `frame`; given, it replaces a published cube that would fit.
+            half_side: As for `frame`; if given, it also replaces a published cube that fits.
             points: As for `frame`.
         """
         return self
 
     def bounds(self, views: Views) -> Tensor | None:
-        """Least and largest corner of the field's box in the world, if it needs one. [2, 3]"""
+        """Lower and upper corner of the field's bounding box in the world, if it has one. [2, 3]"""
         return None
 
 
@@ -237,7 +237,7 @@ def opacity_error(rendering: Rendering, rays: Batch) -> Tensor:
 def background_opacity(rendering: Rendering, rays: Batch) -> Tensor:
     """Opacity of the rays at pixels with alpha 0, summed and divided by the number of all rays. []
 
-    Its gradient does not fade as opacity falls: faint floaters go as well.
+    Its gradient does not vanish with the opacity, so that faint floaters are removed, too.
     """
     return (rendering.opacity * (rays["alpha"] == 0)).mean()
 
@@ -245,8 +245,8 @@ def background_opacity(rendering: Rendering, rays: Batch) -> Tensor:
 def opacity_shortfall(rendering: Rendering, rays: Batch) -> Tensor:
     """Mean squared amount by which rays are too transparent for their colours. []
 
-    For images without alpha: a colour ``c`` in front of a background ``b`` takes an opacity of at
-    least ``|c - b| / max(b, 1 - b)``, whatever the colour of the surface.
+    For images without alpha: a colour ``c`` over a background ``b`` needs an opacity of at least
+    ``|c - b| / max(b, 1 - b)``, whatever the colour of the surface.
     """
     background = rays["background"]
     gap = (rays["target"] - background).abs() / torch.maximum(background, 1 - background)
@@ -254,6 +254,6 @@ def opacity_shortfall(rendering: Rendering, rays: Batch) -> Tensor:
 
 
 def warm_cosine(step: int, progress: float, *, warmup: int, final: float) -> float:
-    """A linear rise over ``warmup`` steps on half a cosine from 1 to ``final``."""
+    """Linear warm-up over ``warmup`` steps, times cosine decay from 1 to ``final``."""
     warm = min(1.0, (step + 1) / max(1, warmup))
     return warm * (final + (1 - final) * 0.5 * (1 + math.cos(math.pi * progress)))

@@ -34,21 +34,21 @@ class Initialisation:
     """A field's initialisation and how it was made.
 
     Attributes:
-        model: The model's settings as the field is to be built: the source decides about channels,
-            decoder and whether there are planes of time.
-        frame: The field's frame: the source's own, or the scene's.
+        model: Settings with which the field is built. The source determines channels, decoder and
+            whether there are time planes.
+        frame: The field's frame: the source's, if it has one, or the scene's.
         values: Planes, decoder and sparse part; None for a random initialisation.
         report: The decomposition for metrics.json: per orientation, and as ``unexplained`` the
             share of the sparse part's energy that the time planes do not explain: ``before`` with
             random planes, ``after`` with the initial ones.
-        seconds: Seconds of each stage; of one from the cache those that it took to make. The last
-            one, ``fill``, is the sampler's and known once the field is built.
-        words: The initialisation in one line.
-        pictures: By name, colours from 0 to 1: the two parts at a few timesteps, and what the model
-            was shown. [H, W, 3] each
-        lrm: What the model made of the scene, for metrics.json.
-        skipped: For metrics.json: shares of the ``frames`` that equal others and did not pass
-            through the model, and of the singular ``directions`` that were not formed.
+        seconds: Seconds of each stage; for a cached stage, those of its original computation.
+            ``fill``, the occupancy grid, is added once the field is built.
+        words: One-line description.
+        pictures: Images by name, from 0 to 1: both parts at a few timesteps, and the LRM's input.
+            [H, W, 3] each
+        lrm: Facts about the LRM's input and frame, for metrics.json.
+        skipped: Shares for metrics.json: ``frames`` that equal others and were not encoded, and
+            singular ``directions`` that were not computed.
     """
 
     model: ModelSettings
@@ -64,15 +64,15 @@ class Initialisation:
 
 @dataclass(frozen=True)
 class Place:
-    """Where and for what an initialisation is made.
+    """Context of an initialisation.
 
     Attributes:
         scene: The scene.
-        frame: The frame of the scene, for sources that bring none.
-        device: Where it is computed.
+        frame: The frame of the scene, for sources without their own.
+        device: Device of the computation.
         devices: Processes that share the run.
-        say: Takes a line before something slow begins.
-        half_side: Half the side of the scene's cube, where the user sets it.
+        say: Prints a line before a slow stage.
+        half_side: Half the side of the scene's cube, if the user has set it.
     """
 
     scene: Scene
@@ -84,17 +84,17 @@ class Place:
 
 
 class Initialiser(ABC):
-    """A source that is ready: its files are found, its weights loaded.
+    """A source of the initialisation, with its files found and its weights loaded.
 
     Attributes:
-        key: Hash of the weights, for keys of cached stages; empty if there are none.
+        key: Hash of the weights, for the keys of cached stages; empty if there are none.
     """
 
     key: str = ""
 
     @abstractmethod
     def initialise(self, method: "Method", place: Place) -> Initialisation:
-        """Make the initialisation of a field.
+        """Compute the initialisation of a field.
 
         Raises:
             ConfigError, SceneError, LRMError: If the source is damaged or does not fit the settings
@@ -107,20 +107,20 @@ class InitialiserSettings(Settings, ABC):
     """Base of the settings in the group ``lrm``."""
 
     gives: ClassVar[str] = "planes"
-    """What a field is initialised with; a model whose `takes` is another refuses it."""
+    """Kind of initialisation; a model accepts it only if its `takes` is the same."""
 
     name: str  # Name in run directories and tables.
 
     @abstractmethod
     def load(self, say: Callable[[str], None] = print) -> Initialiser | None:
-        """Find the source, before anything slow begins; None for a random initialisation.
+        """Find files and load weights before a slow stage; None for a random initialisation.
 
         Args:
-            say: Takes a line before anything is downloaded.
+            say: Prints a line before a download.
 
         Raises:
             ConfigError: If a file is missing or not named.
-            LRMError: If the weights of a model cannot be had, or do not fit.
+            LRMError: If an LRM's weights cannot be obtained or do not fit.
         """
 
 
@@ -138,8 +138,8 @@ class PreparationSettings(Settings):
 
     cache: Location | None  # Folder of cached stages; null disables the cache.
     frames: Count | None  # Timesteps of the fixed-view video; null: the views' distinct times.
-    # Fixed-view video. video: the scene's; train: rendered by a trained field; auto: the scene's if
-    # usable.
+    # Source of the fixed-view video. video: the scene; train: rendered by a trained field; auto:
+    # the scene if its video is usable, else train.
     fixed_view: Literal["auto", "video", "train"]
     fixed_view_model: str  # Model of the trained field: a file of conf/model.
     fixed_view_seconds: Positive | None  # Maximum training seconds of the field; null: no limit.
@@ -170,26 +170,26 @@ class DecompositionSettings(Settings):
     # Time planes. rank1: fitted to the sparse part; random: near 0; ones: 1, as in K-Planes.
     dynamic: Literal["random", "ones", "rank1"]
     noise: Annotated[float, Range(0)]  # Standard deviation of the noise on time planes.
-    cache: bool  # Cache both parts (twice the size of the triplanes).
+    cache: bool  # Cache the two parts (twice the size of the triplanes).
 
     def check(self) -> None:
         if self.dynamic == "random" and self.noise == 0:
             raise ConfigError(
-                "noise=0 with decomposition.dynamic=random: time planes of zeros never learn, as "
-                "products of two zeros have no gradient; set decomposition.noise=0.01"
+                "noise=0 with decomposition.dynamic=random: time planes of zeros never learn, as a "
+                "product of two zeros has no gradient; set decomposition.noise=0.01"
             )
 
 
 @dataclass(frozen=True)
 class Method:
-    """How a field is made and trained: all settings that do not depend on the data or the machine.
+    """All settings of a method that do not depend on the data or the machine.
 
     Attributes:
-        seed: Source of all randomness.
+        seed: Seed of all random numbers.
         model: Field, sampler, losses and learning rates.
-        lrm: What the field is initialised from.
-        preparation: How an initialisation is made.
-        decomposition: How triplanes become planes.
+        lrm: Source of the initialisation.
+        preparation: Steps before training.
+        decomposition: Triplanes to planes.
         losses: Further terms of the loss by name; those of weight 0 are left out.
     """
 
@@ -222,8 +222,8 @@ class Method:
             raise ConfigError(f"{error} (recipe={recipe} changes settings of the model)") from None
         if "lrm" not in config:
             raise ConfigError(
-                f"lrm: model={model.name} chooses none; write `- /lrm@_global_.lrm: none`, or the "
-                "LRM that it takes unless told otherwise, into the defaults of the model's file"
+                f"lrm: model={model.name} chooses none; add `- /lrm@_global_.lrm: none`, or its "
+                "default LRM, to the defaults list of the model's file"
             )
         lrm = build(config["lrm"], InitialiserSettings, "lrm")
         if not isinstance(lrm, RandomSettings) and lrm.gives != model.takes:
@@ -265,7 +265,7 @@ class Method:
             )
 
     def plain(self) -> dict[str, Any]:
-        """The same as builtins, as `read` takes it."""
+        """The settings as builtins; the inverse of `read`."""
         return {
             "seed": self.seed,
             **{name: getattr(self, name).plain() for name in self.GROUPS[1:-1]},

@@ -1,9 +1,9 @@
 """X-Planes: feature planes initialised from an LRM, and the LRM's decoder (the paper's Section 3).
 
-A point (x, y, z) at time t is read from space planes and space-time planes (Eq. 14, 15); its
-features go through the decoder to colour and density; rays are composited and compared with the
-images. Beside the colour's error the loss holds smoothness of the planes and L_r, which ties
-products of the space-time planes to the sparse part of the LRM's triplanes (Eq. 17).
+Features of a point (x, y, z) at time t are interpolated in space planes and space-time planes
+(Eq. 14, 15). The decoder maps them to colour and density, which are composited along rays and
+compared with the images. The loss also contains smoothness of the planes and L_r, which keeps
+products of the space-time planes near the sparse part of the LRM's triplanes (Eq. 17).
 """
 
 from collections.abc import Callable, Mapping
@@ -41,13 +41,13 @@ from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
 from xplanes.streams import Stream, TrainingState, step_generator
 
 FINE_WARMUP = 100
-"""Steps over which the learning rate of fine planes rises."""
+"""Warm-up steps of the fine planes' learning rate."""
 
 TEXELS_PER_PIXEL, TEXEL_STEP, MOST_TEXELS = 0.66, 32, 256
-"""Texels of fine planes where settings leave them open: how many, rounded to what, at most."""
+"""Texels of fine planes with texels=auto: per image pixel, rounded to multiples of, and at most."""
 
 FINER = 2.0
-"""Times as many texels as the space planes have that fine planes need to be worth their time."""
+"""Fine planes are used only if they have at least this many times the space planes' texels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,9 +59,9 @@ class DecoderSettings(Settings):
     activation: Literal["relu", "silu"]  # Activation between layers.
     density: Literal["softplus", "exp"]  # Activation of the density.
     density_scale: Positive  # Factor on the density.
-    density_bias: float  # Initial bias of the density logit; lower: an emptier field.
-    # Initial bias of the colour logits; above 0: nearer to the white background. Unused if a
-    # background is learnt.
+    density_bias: float  # Initial bias of the density logit; lower values give an emptier field.
+    # Initial bias of the colour logits. Above 0, colours begin near a white background. Unused if
+    # a background is learnt.
     colour_bias: float
     colour_margin: Weight  # Margin by which colours may exceed [0, 1].
     freeze: bool  # Do not train the decoder.
@@ -69,10 +69,10 @@ class DecoderSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class FineSettings(Settings):
-    """Fine space planes, zero at first, that are added to some channels of the space planes."""
+    """Fine space planes, initially zero, that are added to the first channels of space planes."""
 
-    # Texels along each space axis. auto: two for three image pixels that the field's cube covers;
-    # none where things move in front of surroundings.
+    # Texels along each space axis. auto: two per three image pixels across the field's cube; no
+    # fine planes for moving scenes with surroundings.
     texels: Count | Literal["auto"]
     channels: Count  # Channels of each plane.
     start: Steps  # Step from which they are trained.
@@ -83,7 +83,7 @@ class FineSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class XPlanesLoss(Settings):
-    """Weights of the terms of the loss beyond the colour's mean squared error."""
+    """Weights of the loss terms besides the mean squared error of colours."""
 
     opacity: Weight  # Weight of the squared error of opacity against the images' alpha.
     floaters: Weight  # Weight of the mean opacity of rays at pixels with alpha 0.
@@ -98,10 +98,10 @@ class XPlanesLoss(Settings):
     time_variation: Weight  # Weight of the time planes' total variation.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the time planes' mean square.
-    # Weight of the light that passes the cube, if a background is learnt. It falls to 0 over
-    # `model.loss.passing_steps`: until the cube has taken shape, the background, which learns
-    # faster, must not take over what lies in it. Time planes are not trained before: fog that
-    # differs from view to view would stop the light, and stay.
+    # Weight of the cube's mean transmittance, if a background is learnt; it falls to 0 over
+    # `model.loss.passing_steps`. The background learns faster than the field, and would otherwise
+    # reproduce the cube's content. Time planes are not trained until then: they would build fog
+    # that differs from view to view, blocks the light and persists.
     passing: Weight
     passing_steps: Steps  # Steps over which `model.loss.passing` falls to 0.
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
@@ -115,7 +115,7 @@ class XPlanesLoss(Settings):
     every: Count  # Steps between evaluations of the regularisers; weights are scaled to match.
 
     def before_background(self) -> "XPlanesLoss":
-        """The same with the weights of time planes in scenes where a background is learnt."""
+        """The weights for scenes in which a background is learnt."""
         weights = {
             name: self.time_factor_with_background * getattr(self, name)
             for name in ("time_variation", "time_smoothness", "time_magnitude")
@@ -194,7 +194,7 @@ class XPlanesSettings(ModelSettings):
     def random_planes(
         self, plane_set: str, rows: int, generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """Planes at random with so many rows of time, see `fields.xplanes.random_planes`."""
+        """Random planes with ``rows`` rows along time, see `fields.xplanes.random_planes`."""
         return random_planes(
             plane_set,
             channels=self.channels,
@@ -210,7 +210,7 @@ class XPlanesSettings(ModelSettings):
         return XPlanesModel(self, self.build_field(site, initial), site, initial)
 
     def build_field(self, site: Site, initial: InitialValues | None = None) -> XPlanes:
-        """The field: planes and decoder from what is given, the rest of it random."""
+        """The field: planes and decoder from the initial values, where given, otherwise random."""
         plane_set = self.plane_set if site.moves else "three"
         background = None if self.background is None else self.background.build(site)
         generator = step_generator(site.seed, 0, Stream.INITIAL_FIELD)
@@ -240,19 +240,19 @@ class XPlanesSettings(ModelSettings):
         else:
             with torch.no_grad():
                 decoder.layers[-1].bias[0] += options.density_bias  # type: ignore[index]
-                if background is None:  # White fog in front of it would fade to nothing.
+                if background is None:  # White fog before a learnt background would fade away.
                     decoder.layers[-1].bias[1:] += options.colour_bias  # type: ignore[index]
         decoder.requires_grad_(not options.freeze)
         return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set, background=background)
 
 
 class XPlanesModel(Model):
-    """The colour's error, smooth planes, and products of time planes near what moves.
+    """X-Planes with its losses, parameter groups and schedule.
 
     Args:
         settings: Weights and learning rates.
         field: The field.
-        site: What it was built for.
+        site: Context for which the field was built.
         initial: Initial values; None for a random initialisation.
     """
 
@@ -329,7 +329,7 @@ class XPlanesModel(Model):
         if (background := self._field.background) is not None:
             if (options := self.settings.background) is not None:
                 terms |= options.losses(background, rendering, rays, state)
-            return terms  # Neither alpha nor a known background says what is opaque.
+            return terms  # The images have neither alpha nor a known background.
         if self.opacity:
             error = opacity_shortfall if self._opaque else opacity_error
             terms["opacity"] = self.opacity * error(rendering, rays)
@@ -359,9 +359,9 @@ class XPlanesModel(Model):
             self.settings.background.regularise(field.background, every)
         fading = self._fading(state.step)
         if not fading:
-            self._initial, self.product = [], None  # Large, and of no more use.
+            self._initial, self.product = [], None  # Frees memory: both are large.
         elif self.initial_weight:
-            # The field may have moved to another device since.
+            # The field may have been moved to another device.
             self._initial = [plane.to(field.space.device) for plane in self._initial]
             weight = fading * self.initial_weight * every
             for plane, initial in zip(self._planes, self._initial, strict=True):
@@ -381,7 +381,7 @@ class XPlanesModel(Model):
             away = (field.time.detach() - 1).sign()
             field.time.grad.add_(away, alpha=weight / field.time.numel())
         if self.product is not None:
-            # The same frames on all ranks: their planes must stay equal.
+            # The same frames on all ranks, so that their planes stay equal.
             generator = step_generator(state.seed, state.step, Stream.FRAMES)
             weight = fading * weights.sparse_weight * every
             self.product.add_gradient(field.time.grad, field.time, weight, generator)  # Eq. 17
@@ -407,10 +407,10 @@ class XPlanesModel(Model):
         return {name: weight * float(value()) for name, (weight, value) in terms.items() if weight}
 
     def _variation(self) -> dict[str, tuple[Tensor, tuple[int, ...], float]]:
-        """Stacks of planes by term: the axes along which they shall be smooth, and the weight."""
+        """For each term: a stack of planes, the axes of its total variation, and its weight."""
         space, time = self._field.space, self._field.time
         coded = self.weights.variation == "coded"
-        # Coded: twice the sum over planes, in which space planes count twice (as `PlaneTerms`).
+        # coded: twice the sum over planes, with space planes counted twice (as in `PlaneTerms`).
         weight = self.total_variation * (4 * len(space) if coded else 1)
         found: dict[str, tuple[Tensor, tuple[int, ...], float]] = {
             "total_variation": (space, (1, 2), weight)
@@ -430,7 +430,7 @@ class XPlanesModel(Model):
         )
 
     def _passing(self, step: int) -> float:
-        """Weight of the light that passes the cube; 0 without a background."""
+        """Weight of the cube's mean transmittance; 0 without a learnt background."""
         steps = self.weights.passing_steps
         if self._field.background is None or not steps:
             return 0.0

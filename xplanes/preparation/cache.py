@@ -79,7 +79,7 @@ class StageCache:
             inputs: Everything that the result depends on: tensors, numbers, strings, lists, dicts.
             make: Computes it: a dict of tensors and builtins.
             keep: Whether to use the cache for this stage.
-            alone: Whether a second process waits for the first one that computes the same stage.
+            alone: Whether other processes wait while one computes the same stage.
         """
         path, key = self._path(name, inputs)
         path = path if keep else None
@@ -108,7 +108,7 @@ class StageCache:
 
     @contextmanager
     def workshop(self, name: str, inputs: Any) -> Iterator[Path]:
-        """A folder for intermediate results of a stage, found again after an interruption.
+        """A folder for intermediate results of a stage, reused after an interruption.
 
         It is removed when the block ends without an error.
         """
@@ -128,7 +128,7 @@ class StageCache:
 
 
 def _find(path: Path | None, key: str) -> Stage | None:
-    """The entry in a file, or None where there is none that can be used."""
+    """The entry in a file, or None if there is no usable one."""
     if path is None or not path.exists():
         return None
     try:
@@ -145,7 +145,7 @@ def _find(path: Path | None, key: str) -> Stage | None:
             return Stage(payload["content"], payload["seconds"], True, key)
     except Exception as error:  # A damaged file raises many kinds of errors.
         problem = f"damaged ({type(error).__name__})"
-    logger.warning("%s is %s: making it again", path, problem)
+    logger.warning("%s is %s: it is computed again", path, problem)
     return None
 
 
@@ -178,7 +178,7 @@ def fingerprint(value: Any) -> str:
 
 
 def _feed(digest: Any, value: Any) -> None:
-    # Lengths and types come first, so that different values give different bytes.
+    # Types and lengths are hashed first, so that different values give different bytes.
     if isinstance(value, Tensor):
         digest.update(f"tensor {value.dtype} {tuple(value.shape)}:".encode())
         for part in value.detach().reshape(-1).split(1 << 24):

@@ -21,7 +21,7 @@ class Encoded:
     Attributes:
         triplanes: One per frame, on the CPU. [T, 3, C, H, H]
         distinct: Number of frames that differ.
-        cached: Number of these that came from the cache.
+        cached: Number of distinct frames that came from the cache.
         seconds: Time to encode the distinct frames, now or when they were cached.
     """
 
@@ -45,7 +45,7 @@ def encode(
     """Encode every distinct frame.
 
     Each triplane is cached as soon as it is computed, so that an interrupted run resumes where it
-    stopped. Besides the result, memory use is one batch.
+    stopped. Memory use is the result and one batch.
 
     Args:
         model: The model.
@@ -81,7 +81,7 @@ def encode(
     if missing:
         model = model.to(device)
     chunks = [missing[start : start + batch] for start in range(0, len(missing), batch)]
-    # On a terminal only: in a pipe a progress bar would fill the log.
+    # Only on a terminal: in a log file a progress bar would fill many lines.
     for chunk in tqdm(chunks, "triplanes", unit="batch", leave=False, disable=None):
         began = time.perf_counter()
         first = torch.tensor([places[frame_key][0] for frame_key in chunk])
@@ -90,7 +90,7 @@ def encode(
             planes = model.encode(pictures.to(device)).float().cpu()
         if not bool(planes.isfinite().all()):
             raise LRMError(
-                f"the LRM makes NaN or infinity of frame {int(first[0])} or one of the next: its "
+                f"the LRM makes NaN or infinity of frame {int(first[0])} or a later one: its "
                 f"weights do not work{' in bfloat16; set lrm.precision=32' if bf16 else ''}"
             )
         share = (time.perf_counter() - began) / len(chunk)

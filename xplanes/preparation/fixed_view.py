@@ -51,8 +51,8 @@ def rendering_method(
     found = Method.read(compose_plain("train", [f"model={name}", "lrm=none"]))
     if found.model.sampler.kind is not RadianceField:
         raise ConfigError(
-            f"preparation.fixed_view_model={name}: its renderer takes no single rays; name a model "
-            "of a radiance field, such as six_planes"
+            f"preparation.fixed_view_model={name}: its renderer takes no single rays; choose a "
+            "model with a radiance field, such as six_planes"
         )
     model = found.model.for_scene(views, half_side, points)
     model = replace(model, sampler=model.sampler.for_video(), precision=method.model.precision)
@@ -100,7 +100,7 @@ def fixed_view(
         )
     times = scene.splits["train"].times
     count = 1 if scene.splits["train"].is_static else options.frames or len(times.unique())
-    # Without alpha a video shows surroundings, which LRMs would take for part of the object.
+    # A video without alpha shows surroundings, which an LRM would treat as part of the object.
     whole = scene.video is not None and scene.is_surrounded and scene.video.is_opaque
     if scene.video is not None and (
         options.fixed_view == "video" or (options.fixed_view == "auto" and not whole)
@@ -113,7 +113,7 @@ def fixed_view(
     elif scene.is_surrounded:
         place.say(
             f"fixed view: the images of {scene.name} have no silhouettes, so the LRM is shown "
-            "everything in the cube, the ground included; with masks it is shown the object alone "
+            "everything in the cube, including the ground; with masks it would see only the object "
             "(data.mask_use=lrm)"
         )
     return _rendered(method, place, view, size, count, cache)
@@ -276,7 +276,7 @@ def _budget(options: PreparationSettings) -> str:
 
 
 def intrinsics_key(intrinsics: Intrinsics) -> list[Tensor]:
-    """What cameras' intrinsics consist of, for keys of cached stages."""
+    """Tensors of the cameras' intrinsics, for the keys of cached stages."""
     key = [intrinsics.focal, intrinsics.centre, intrinsics.size]
     if (lenses := intrinsics.lenses) is not None:
         key += [lenses.model, lenses.coefficients, lenses.skew]
@@ -297,9 +297,9 @@ def trained_field(
     Args:
         method: Settings of the field.
         place: The scene and the field's frame.
-        folder: Where its checkpoints lie.
-        steps: Training steps at most.
-        seconds: Seconds of training at most; None for no limit.
+        folder: Folder of its checkpoints.
+        steps: Maximum number of training steps.
+        seconds: Maximum training time in seconds; None for no limit.
         advice: What to change when the loss is not finite: the settings of ``method`` are not the
             user's.
 

@@ -28,7 +28,7 @@ from xplanes.settings import Count, Location
 logger = logging.getLogger(__name__)
 
 SOLID = 128
-"""Alpha from which a pixel belongs to the cropped object."""
+"""Alpha from which a pixel belongs to the object when cropping."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class ImageLRMSettings(InitialiserSettings, ABC):
     """Settings of an LRM and of its input images."""
 
     weights: Location | None  # Local file of weights; null: downloaded or bundled weights.
-    # For focal lengths other than the LRM's. scale: sizes match at the scene's depth; pad: exact.
+    # If focal lengths differ from the LRM's. scale: match sizes at the scene's depth; pad: exact.
     matching: Literal["scale", "pad"]
     crop: bool  # Crop images to the object size in the LRM's training.
     batch: Count  # Images per batch.
@@ -92,7 +92,7 @@ class ImageLRMSettings(InitialiserSettings, ABC):
         """
 
     def bf16_on(self, device: torch.device) -> bool:
-        """Whether the model uses bfloat16 products."""
+        """Whether the model multiplies in bfloat16."""
         return self.precision == "bf16" or (self.precision == "auto" and fast_bf16(device))
 
 

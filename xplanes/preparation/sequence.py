@@ -32,7 +32,7 @@ def write_content(path: Path, content: dict[str, Any]) -> None:
             return
         from safetensors.torch import save_file
 
-        tensors, rest = _apart(content)
+        tensors, rest = _split(content)
         tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
         save_file(tensors, temporary, metadata={MARK: json.dumps(rest)})
 
@@ -54,7 +54,7 @@ def read_content(path: Path) -> Any:
     return content
 
 
-def _apart(content: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def _split(content: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors by dotted name, and the remaining nested dict."""
     tensors: dict[str, Tensor] = {}
     rest: dict[str, Any] = {}
@@ -62,7 +62,7 @@ def _apart(content: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
         if isinstance(value, Tensor):
             tensors[name] = value
         elif isinstance(value, dict):
-            inner, other = _apart(value)
+            inner, other = _split(value)
             tensors |= {f"{name}.{key}": tensor for key, tensor in inner.items()}
             rest[name] = other
         else:
@@ -86,7 +86,7 @@ class TriplaneSequence:
             [T, 3, C, H, H]
         decoder: Weights of their decoder, ``Decoder.state_dict()``; None if there is none.
         decoder_config: Its options, the keys of ``DECODER_OPTIONS``; given with ``decoder``.
-        frame: How the world maps into the triplanes' cube; None for the scene's own frame.
+        frame: Map from the world into the triplanes' cube; None for the scene's own frame.
     """
 
     triplanes: Tensor
@@ -130,7 +130,7 @@ def load_triplanes(path: Path) -> TriplaneSequence:
     except Exception as error:  # A damaged file raises many kinds of errors.
         # The original message advises loading the file as code.
         raise ConfigError(
-            f"{path} cannot be read ({type(error).__name__}): it is damaged, or no file of "
+            f"{path} cannot be read ({type(error).__name__}): it is damaged, or not written by "
             "save_triplanes"
         ) from error
     if not isinstance(content, dict) or "triplanes" not in content:
@@ -194,7 +194,7 @@ def _check_decoder(sequence: TriplaneSequence, name: str) -> None:
         check_arguments(Decoder.__init__, options)
     except ConfigError as error:
         raise ConfigError(f"{name}: decoder_config.{error}") from error
-    # Further constraints are checked with the settings that they replace.
+    # The settings classes check further constraints when these options replace theirs.
     if not (1 <= options["width"] <= 65536 and 0 <= options["hidden"] <= 256):
         raise ConfigError(
             f"{name}: decoder_config.width={options['width']}, hidden={options['hidden']}: out of "

@@ -51,7 +51,7 @@ class BundledLRMSettings(ImageLRMSettings):
             if own.suffix != ".safetensors" or not own.is_file():
                 raise LRMError(
                     f"{own} is no file that ends in .safetensors: name one that xplanes "
-                    "pretrain-lrm wrote, whose .json lies beside it"
+                    "pretrain-lrm wrote, with its .json beside it"
                 )
             model, path = load_bundled(own.stem, own.parent)
         return loaded(model, path, began)
@@ -91,12 +91,12 @@ class LRMInitialiser(Initialiser):
             made.sequence, method, place, cache, source=made.words, seconds=made.seconds
         )
         shown = {} if made.picture is None else {"fixed_view": made.picture}
-        twins = 1 - made.report["distinct"] / made.report["frames"]
+        repeated = 1 - made.report["distinct"] / made.report["frames"]
         return replace(
             found,
             pictures=shown | found.pictures,
             lrm=made.report,
-            skipped=found.skipped | {"frames": twins},
+            skipped=found.skipped | {"frames": repeated},
         )
 
 
@@ -174,7 +174,7 @@ def from_sequence(
         seconds: Seconds of the preceding stages.
     """
     views = place.scene.splits["train"]
-    model = _settled(method, sequence, views, source=source)
+    model = _settings_for(method, sequence, views, source=source)
     if len(sequence.triplanes) == 1 and not views.is_static:
         logger.warning(
             "%s has a single triplane: the field has no time planes and is trained as static",
@@ -202,7 +202,7 @@ def from_sequence(
     )
 
 
-def _settled(
+def _settings_for(
     method: Method, sequence: TriplaneSequence, views: Views, *, source: str
 ) -> XPlanesSettings:
     """The model's settings, with those that the sequence determines."""
@@ -211,7 +211,7 @@ def _settled(
     if views.is_static or frames == 1:
         model = replace(model, plane_set="three")
     if model.plane_set != "three":
-        # Frames of the video tell of more timesteps than few training views do.
+        # The video has more timesteps than a few training views.
         model = replace(model, time_resolution=model.rows_of_time(views.times, frames))
     if sequence.decoder_config is not None:
         try:

@@ -132,9 +132,9 @@ def decompose_stage(
 
     def make() -> dict[str, Any]:
         with warnings.catch_warnings():
-            # The caller warns once for all orientations, also when the parts are cached.
+            # The caller warns once for all orientations, even if the parts are cached.
             warnings.filterwarnings("ignore", message="robust PCA stopped")
-            # Show the progress bar on a terminal only; in a pipe it would fill the log.
+            # Only on a terminal: in a log file a progress bar would fill many lines.
             shown = sys.stderr.isatty()
             parts = decompose(triplanes.to(device), progress=shown, **options)
         report = {
@@ -156,8 +156,8 @@ def convert_stage(
     """Space planes from the low-rank part, time planes from the sparse part.
 
     Args:
-        parts: What `decompose_stage` gave.
-        model: The model's settings, as the field is to be built.
+        parts: Result of `decompose_stage`.
+        model: The model's settings with which the field is built.
         config: Settings of the conversion.
         seed: The run's seed, for the noise.
         cache: Cache of the stage.

@@ -1,4 +1,4 @@
-"""What all renderers share: what rays see, and whole images of it."""
+"""Base classes of renderers: results for rays, and whole images."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from xplanes.scenes.frame import Frame
 
 @dataclass(frozen=True)
 class Rendering:
-    """What rays see.
+    """Rendered rays.
 
     Attributes:
-        colour: In front of the background. [R, 3]
-        opacity: Share of the light that the scene stops. [R]
-        depth: Mean distance of what is seen, 0 where nothing is. [R]
+        colour: Colour, background included. [R, 3]
+        opacity: Accumulated opacity. [R]
+        depth: Expected depth, 0 where opacity is 0. [R]
         density: Density of each sample, without gradient. [N]
         samples: The samples that reached the field.
     """
@@ -33,21 +33,21 @@ class Rendering:
 
 
 class Renderer(ABC):
-    """Renders what cameras see of a scene."""
+    """Renders images of a field from cameras."""
 
     @property
     @abstractmethod
     def device(self) -> torch.device:
-        """Where images are rendered."""
+        """Device on which images are rendered."""
 
     @abstractmethod
     def view(
         self, field: Any, frame: Frame, camera: PosedCamera, time: float, background: Tensor
     ) -> dict[str, Tensor]:
-        """Render what a camera sees at one time.
+        """Render the image of a camera at one time.
 
         Args:
-            field: What the renderer takes as a field.
+            field: A field that the renderer accepts.
             frame: The field's frame.
             camera: A camera in the world.
             time: From 0 to 1.
@@ -60,11 +60,11 @@ class Renderer(ABC):
 
 
 def leave_empty(image: dict[str, Tensor], where: Tensor, background: Tensor) -> None:
-    """Make pixels background, with opacity and depth of 0.
+    """Set pixels to the background, with opacity and depth 0.
 
     Args:
-        image: What `Renderer.view` gives; changed in place.
-        where: The pixels, such as those that a fisheye lens has no ray for. bool [H, W]
+        image: Result of `Renderer.view`; changed in place.
+        where: The pixels, such as those for which a fisheye lens has no ray. bool [H, W]
         background: Colour behind the scene. [3]
     """
     for name, value in image.items():
@@ -72,10 +72,10 @@ def leave_empty(image: dict[str, Tensor], where: Tensor, background: Tensor) -> 
 
 
 class RayRenderer(Renderer):
-    """Renders rays through a field, in a way of its own.
+    """Base class of renderers that trace rays through a field.
 
     Attributes:
-        rays_at_once: Rays of an image rendered together on the CPU; a GPU takes twice as many.
+        rays_at_once: Rays of an image rendered together on the CPU; twice as many on a GPU.
     """
 
     rays_at_once = 4096
@@ -105,12 +105,12 @@ class RayRenderer(Renderer):
         """Render rays.
 
         Args:
-            field: What the renderer takes as a field.
+            field: A field that the renderer accepts.
             origins: Ray origins in the field's frame. [R, 3]
             directions: Unit directions. [R, 3]
             times: Time of each ray, from 0 to 1. [R]
             background: Colour behind the scene. [3] or [R, 3]
-            jitter: What moves samples within their steps in training; None takes the middle.
+            jitter: Offsets of samples within their steps in training; the middle when None.
 
         Returns:
             One value per ray; gradients reach the field.
@@ -121,7 +121,7 @@ class RayRenderer(Renderer):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Colour, opacity and depth of rays without gradients. [R, 3], [R], [R]
 
-        A renderer overrides this where an image can be had for less than what training needs.
+        A renderer overrides this if images cost less to render than training batches.
         """
         seen = self.render(field, origins, directions, times, background)
         return seen.colour, seen.opacity, seen.depth

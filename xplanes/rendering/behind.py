@@ -1,4 +1,4 @@
-"""What rays see behind the box in which a field lives."""
+"""The background of rays, behind the field's bounding box."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,10 +11,10 @@ from xplanes.rendering.box import ray_box
 from xplanes.rendering.compositing import OPAQUE, composite
 
 DARK = 1e-3
-"""Share of the light that must pass the field for a ray to look behind it."""
+"""Transmittance of the field below which a ray's background is not computed."""
 
 Ends = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""From origins and directions to the distances at which rays enter and leave a box, see `ray_box`.
+"""Maps origins and directions to the distances at which rays enter and leave a box: `ray_box`.
 
 [R, 3], [R, 3] -> [R], [R]
 """
@@ -29,27 +29,27 @@ def behind(
     jitter: Tensor | None = None,
     ends: Ends = ray_box,
 ) -> Tensor:
-    """Colours behind a field: of its background where it has one, else a plain one.
+    """Colours behind a field: of its learnt background if it has one, else a constant colour.
 
     Args:
-        field: Its ``background`` is a `Background`, None, or not there.
+        field: A field whose ``background`` is a `Background`, None or missing.
         origins: Ray origins in the field's frame. [R, 3]
         directions: Unit directions. [R, 3]
-        opacity: Share of each ray's light that the field stops; the background of rays that it
-            stops whole is not computed, and black. [R]
+        opacity: Opacity of the field along each ray. Behind opaque rays no background is computed;
+            it is black. [R]
         plain: Colour behind a field without a background. [3] or [R, 3]
-        jitter: Place of each ray's samples within their steps; the middle when None. [R]
-        ends: Where rays meet the field's box.
+        jitter: Offset of each ray's samples within their steps; the middle when None. [R]
+        ends: Intersects rays with the field's box.
 
     Returns:
-        Gradients reach the background. [3] or [R, 3]
+        Colours; gradients reach the background. [3] or [R, 3]
     """
     background: Background | None = getattr(field, "background", None)
     if background is None:
         return plain
     clear = opacity.detach() < 1 - DARK
     if clear.device.type != "cpu":
-        # Looking for those few would be waited for.
+        # Selecting the rays would wait for the device.
         return torch.where(clear[:, None], look(background, origins, directions, jitter, ends), 0)
     seen = clear.nonzero()[:, 0]
     place = None if jitter is None else jitter[seen]
@@ -65,17 +65,17 @@ def look(
     jitter: Tensor | None = None,
     ends: Ends = ray_box,
 ) -> Tensor:
-    """Colours that rays see in a background, from where they leave a field's box to infinity.
+    """Colours of a background along rays, from their exit from the field's box to infinity.
 
-    Samples are even in inverse distance, and the last one, at infinity, is opaque. A ray that
-    misses the box looks from half its origin's distance from the frame's centre on.
+    Samples are uniform in inverse distance, and the last one, at infinity, is opaque. On a ray that
+    misses the box they begin at half its origin's distance from the frame's centre.
 
     Args:
         background: The background.
         origins: Ray origins in the field's frame. [R, 3]
         directions: Unit directions. [R, 3]
-        jitter: Place of each ray's samples within their steps; the middle when None. [R]
-        ends: Where rays meet the box.
+        jitter: Offset of each ray's samples within their steps; the middle when None. [R]
+        ends: Intersects rays with the box.
 
     Returns:
         [R, 3]

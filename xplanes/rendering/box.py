@@ -1,4 +1,4 @@
-"""Where rays meet the cube in which a field lives, and what they ask of it."""
+"""Intersection of rays with the field's cube, and evaluation of the field at their samples."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 Field = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""From points [N, 3] and times [N] to colour [N, 3] and density [N]."""
+"""Maps points [N, 3] and times [N] to colour [N, 3] and density [N]."""
 
 
 def ray_box(origins: Tensor, directions: Tensor, half: float = 1.0) -> tuple[Tensor, Tensor]:
@@ -19,11 +19,11 @@ def ray_box(origins: Tensor, directions: Tensor, half: float = 1.0) -> tuple[Ten
         half: Half the side of the cube.
 
     Returns:
-        Near and far, near >= 0 (0 from inside). A ray that misses the cube, has no direction or
-        holds a NaN has near = far = 0. [R], [R]
+        Near and far, near >= 0 (0 from inside). Both are 0 for a ray that misses the cube, has
+        direction 0 or contains a NaN. [R], [R]
     """
-    # A ray parallel to a face divides by zero: infinities of the right sign are what the slab test
-    # wants, and 0 * inf (a ray that runs along a face) counts as inside that slab.
+    # A ray parallel to a face divides by zero. The slab test works with the infinities that result;
+    # 0 * inf (a ray within a face) counts as inside that slab.
     inverse = directions.reciprocal()
     first, second = (-half - origins) * inverse, (half - origins) * inverse
     near = torch.minimum(first, second).nan_to_num(-torch.inf, torch.inf, -torch.inf)
@@ -34,7 +34,7 @@ def ray_box(origins: Tensor, directions: Tensor, half: float = 1.0) -> tuple[Ten
 
 
 def snapshot(field: Any, time: float) -> Any:
-    """A field for one time alone: its own `RadianceField.snapshot` if it has one, else itself."""
+    """The `RadianceField.snapshot` of a field at one time, if it has that method, else itself."""
     taken = getattr(field, "snapshot", None)
     return field if taken is None else taken(time)
 
@@ -45,7 +45,7 @@ def shade(
     """Colour and density at the samples of rays.
 
     Args:
-        field: Takes points and times, and directions too if it is ``view_dependent``.
+        field: Maps points and times, and also directions if it is ``view_dependent``.
         points: Positions of the samples. [N, 3]
         times: Time of each ray. [R]
         directions: Unit direction of each ray. [R, 3]

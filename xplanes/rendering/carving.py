@@ -1,4 +1,4 @@
-"""Silhouettes into the occupancy grid."""
+"""Pruning of the occupancy grid by silhouettes."""
 
 import torch
 from torch import Tensor
@@ -9,15 +9,15 @@ from xplanes.scenes.silhouettes import join_in_time, may_hold
 from xplanes.scenes.views import Views
 
 CHUNK = 2**17
-"""Points that are looked at together, for up to 512 views; fewer for more."""
+"""Points that are projected together, for up to 512 views; fewer for more views."""
 
 
 def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
-    """Empty the grid's cells that the silhouettes of the training views show to be empty.
+    """Empty the cells that lie outside the silhouettes of the training views.
 
-    What one view shows empty at its time is ruled out for good. What only views of neighbouring
-    times show together is presumed empty: things may have moved in between, so what is occupied
-    may grow into it.
+    A cell that a view shows to be empty at its own time is excluded permanently. A cell that only
+    views of neighbouring times show to be empty is presumed empty: objects may have moved in
+    between, so that occupied cells may grow into it.
 
     Args:
         grid: Changed in place.
@@ -47,7 +47,7 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
 
 
 def _views_of_bins(times: Tensor, bins: int) -> list[Tensor]:
-    """Views that speak for each time bin: those inside it and the next one on either side."""
+    """Views used for each time bin: those inside it and the nearest one on either side."""
     order = times.argsort(stable=True)
     ordered = times[order].contiguous()
     covers = []

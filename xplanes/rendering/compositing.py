@@ -1,4 +1,4 @@
-"""From densities and colours along rays to pixels."""
+"""Volume rendering: from densities and colours along rays to pixels."""
 
 import functools
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from xplanes.backend import compiled, cpu_loops, gpu_kernels, gpu_module, proven, waves
 
 OPAQUE = 80.0
-"""Optical depth beyond which nothing is seen: exp(-80) is 2e-35."""
+"""Optical depth that counts as opaque: exp(-80) is 2e-35."""
 
 
 def composite(
@@ -22,22 +22,22 @@ def composite(
     starts: Tensor,
     number: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Merge the samples of each ray, by Beer and Lambert.
+    """Composite the samples of each ray (Beer-Lambert law).
 
     ``w_i = exp(-sum_{j<i} tau_j) (1 - exp(-tau_i))`` within each ray, from sums of optical depths,
-    so that no depth from 0 to the largest number makes a NaN or an infinity. A depth that is NaN
-    makes its ray NaN. Gradients reach depths and colours. On the CPU compiled loops do the work, on
-    CUDA Triton kernels where they prove themselves, elsewhere `composite_reference`.
+    so that no depth from 0 to the largest number gives a NaN or an infinity. A depth that is NaN
+    makes its ray NaN. Gradients reach depths and colours. Computed by compiled loops on the CPU, by
+    Triton kernels on CUDA if they pass their trial, and otherwise by `composite_reference`.
 
     Args:
-        optical_depth: Density times length of each sample, samples of a ray side by side from front
-            to back. [N]
+        optical_depth: Density times length of each sample; samples of a ray are contiguous, from
+            front to back. [N]
         colour: Colour of each sample. [N, 3]
         distances: Distance of each sample from the ray's origin. [N]
         ray: Ray of each sample, ascending. [N]
-        starts: Index of each ray's first sample; of the next ray's where it has none. [R]
-        number: Samples that there are, where the tensors have room for more; None if they have not.
-            The places behind belong to the last ray and hold depths of 0. int64 []
+        starts: Index of each ray's first sample, or of the next ray's if it has none. [R]
+        number: Number of samples if the tensors have unused slots at the end, else None. Unused
+            slots belong to the last ray and have depth 0. int64 []
 
     Returns:
         For each ray the sums of weight times (colour, 1, distance) in float32 or better, and the
@@ -56,9 +56,9 @@ def composite(
 def composite_reference(
     optical_depth: Tensor, colour: Tensor, distances: Tensor, ray: Tensor, starts: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The same as `composite`, written for reading."""
+    """Reference implementation of `composite`."""
     depth = optical_depth.clamp(0, OPAQUE)
-    # A NaN must not reach other rays through the running sum; it stays in its own sample's weight.
+    # A NaN must not reach other rays through the running sum; it affects only its own weight.
     before = depth_before(depth.nan_to_num(0), ray, starts)
     weights = before.neg().exp().to(depth.dtype) * stopped(depth)
     values = torch.cat([colour, torch.ones_like(distances)[:, None], distances[:, None]], dim=1)
@@ -73,24 +73,24 @@ def composite_gpu(
     starts: Tensor,
     number: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """The same as `composite`, in Triton kernels: one for the values, one for the gradients."""
+    """`composite` in Triton: one kernel for the values, one for the gradients."""
     return _Kernels.apply(optical_depth, colour, distances, starts, number)  # type: ignore[return-value]
 
 
 def stopped(optical_depth: Tensor) -> Tensor:
-    """Share of the light that an optical depth stops, all digits kept in value and gradient. [...]
+    """Opacity of an optical depth, with full precision in value and gradient. [...]
 
-    The gradient of ``expm1`` is taken from its value, which is near -1 in thick media.
+    Autograd computes the gradient of ``expm1`` from its value, and loses digits near -1.
     """
     thin = -torch.expm1(-optical_depth)
     return torch.where(optical_depth < 0.5, thin, 1 - (-optical_depth).exp())
 
 
 def depth_before(optical_depth: Tensor, ray: Tensor, starts: Tensor) -> Tensor:
-    """Optical depth, or what else adds up, in front of each sample on its own ray. float64 [N]
+    """Sum of the values in front of each sample on its own ray, such as optical depths. float64 [N]
 
-    One running sum over all rays, less the sum at the ray's first sample. In float64, with depths
-    limited to `OPAQUE`, a million samples keep seven digits behind the point.
+    One running sum over all rays, minus the sum at the ray's first sample. In float64, with depths
+    limited to `OPAQUE`, a million samples keep seven decimal places.
     """
     depth = optical_depth.double()
     total = depth.cumsum(0) - depth
@@ -106,28 +106,28 @@ def distortion(
     ends: Tensor,
     step: float,
 ) -> Tensor:
-    """How far apart along a ray its light is stopped: mean distance of two photons, over all rays.
+    """Distortion loss: expected distance between two absorption events on a ray, mean over rays.
 
-    Light that no sample stops counts as stopped at ``ends``. Zero for rays that end at one surface;
-    fog, and half a surface before another, have large values.
+    Light that passes all samples counts as absorbed at ``ends``. The loss is zero for rays that end
+    at one surface, and large for fog or a semi-transparent surface in front of another.
 
     Args:
         optical_depth: Density times length of each sample, as in `composite`. [N]
         distances: Distance of each sample from the ray's origin. [N]
         ray: Ray of each sample, ascending. [N]
-        starts: Index of each ray's first sample; of the next ray's where it has none. [R]
-        total: The rays' sums that `composite` gives. [R, 5]
-        ends: Where light that passes all samples is stopped. [R]
+        starts: Index of each ray's first sample, or of the next ray's if it has none. [R]
+        total: Sums per ray from `composite`. [R, 5]
+        ends: Distance at which light that passes all samples is absorbed. [R]
         step: Length of a sample.
 
     Returns:
         In units of ``distances``, differentiable with respect to optical depths. []
 
-    Source: Mip-NeRF 360, Eq. 15, with the light behind the samples as one more.
+    Source: Mip-NeRF 360, Eq. 15, with the transmitted light as one more sample.
     """
     depth = optical_depth.clamp(0, OPAQUE)
     weights = depth_before(depth, ray, starts).neg().exp().to(depth.dtype) * stopped(depth)
-    # Pairs of which each sample is the farther one, and pairs within a sample.
+    # Pairs in which each sample is the farther one, and pairs within a sample.
     pairs = distances * depth_before(weights, ray, starts)
     pairs = weights * (pairs - depth_before(weights * distances, ray, starts))
     within = weights.square() * (step / 3)
@@ -184,7 +184,7 @@ class _Kernels(torch.autograd.Function):
         if number is None:
             number = starts.new_full((), len(optical_depth))
         inputs = [t.contiguous() for t in (optical_depth, colour, distances, starts, number)]
-        # Places behind the last sample are not written to.
+        # The kernel does not write to unused slots at the end.
         weights, light = torch.zeros_like(inputs[0]), torch.empty_like(inputs[0])
         total = optical_depth.new_empty(len(starts), 5)
         gpu.launch(gpu.forward, len(starts), inputs, (weights, light, total), OPAQUE)
@@ -208,7 +208,7 @@ class _Kernels(torch.autograd.Function):
 
 @functools.cache
 def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
-    """Whether the kernels prove themselves on rays of several lengths, gradients included."""
+    """Whether the kernels pass their trial on rays of several lengths, gradients included."""
 
     def attempt(function: Callable[..., Any], precision: torch.dtype) -> list[Tensor]:
         # A ray of many samples, one of none, and one of a single sample.

@@ -1,8 +1,8 @@
-"""Triton kernels for samples along rays on CUDA; `compositing` holds the readable twin.
+"""Triton kernels for compositing on CUDA; the reference implementation is in `compositing`.
 
-A program takes a ray and walks along it, a block of samples at a time. Sums run in the precision of
-the optical depths. Nothing is added up by several programs, so that results are the same to the
-last bit each time. Imported only when needed, since triton takes a while to load.
+A program handles one ray, a block of samples at a time, with sums in the precision of the optical
+depths. No sum is shared between programs, so that results are deterministic. Imported only when
+needed, since triton takes a while to load.
 """
 
 # ruff: noqa: D103 (the callers in compositing.py document these kernels)
@@ -12,15 +12,15 @@ import triton
 import triton.language as tl
 
 BLOCK = 32
-"""Samples that a program takes at once: a thread each."""
+"""Samples per block of a program: one per thread."""
 
 TERMS = tl.constexpr(12)
-"""Terms of the series of `stopped`, which ends below the 13th digit."""
+"""Terms of the series in `stopped`; the remainder is below the 13th digit."""
 
 
 @triton.jit
 def ends_of(starts, number, rays):
-    """A ray, its first sample, and the place behind its last one."""
+    """Index of a ray, of its first sample, and one past its last sample."""
     ray = tl.program_id(0)
     end = tl.load(starts + ray + 1, mask=ray + 1 < rays, other=tl.load(number))
     return ray, tl.load(starts + ray), end
@@ -28,7 +28,7 @@ def ends_of(starts, number, rays):
 
 @triton.jit
 def limited(optical_depth, n, live, opaque):
-    """Optical depths from 0 to the largest that counts; a NaN stays one."""
+    """Optical depths, clamped to [0, ``opaque``]; NaN stays NaN."""
     depth = tl.load(optical_depth + n, mask=live, other=0.0)
     depth = tl.where(depth < 0, 0.0, depth)
     return tl.where(depth > opaque, opaque, depth).to(optical_depth.dtype.element_ty)
@@ -36,7 +36,7 @@ def limited(optical_depth, n, live, opaque):
 
 @triton.jit
 def stopped(depth):
-    """Share of the light that an optical depth stops, all digits kept."""
+    """Opacity of an optical depth, with full precision."""
     thin = tl.where(depth < 0.5, depth, 0.0)
     series = tl.full(depth.shape, 1.0, depth.dtype)
     for k in tl.static_range(TERMS):
@@ -64,8 +64,8 @@ def forward(
     for first in range(start, end, BLOCK):
         n = first + tl.arange(0, BLOCK)
         live = n < end
-        # What lies in front is added up without the sample itself, which would cost digits. A NaN
-        # stays in its own sample's weight.
+        # The sum in front excludes the sample itself: subtracting it later would lose digits. A NaN
+        # affects only its own weight.
         front = limited(optical_depth, n - 1, live & (n > start), opaque)
         front = tl.where(front == front, front, 0.0)
         left = tl.exp(-(before + tl.cumsum(front, 0)))
@@ -87,7 +87,7 @@ def forward(
 
 @triton.jit
 def value_of(colour, distances, n, live, red, green, blue, opacity, far):
-    """What a sample's weight is worth, by the gradient of its ray's sums."""
+    """Gradient with respect to a sample's weight, from the gradient of its ray's sums."""
     value = red * tl.load(colour + 3 * n, mask=live, other=0.0)
     value += green * tl.load(colour + 3 * n + 1, mask=live, other=0.0)
     value += blue * tl.load(colour + 3 * n + 2, mask=live, other=0.0)
@@ -119,8 +119,8 @@ def backward(
     for block in range(blocks):
         n = start + (blocks - 1 - block) * BLOCK + tl.arange(0, BLOCK)
         live, inner = n < end, n + 1 < end
-        # From back to front, again without the sample itself: a small number in front of nothing
-        # keeps all its digits, which matters to an optimiser that scales them up.
+        # From back to front, again without the sample itself: tiny gradients keep all digits, which
+        # matters because Adam rescales them.
         value = value_of(colour, distances, n + 1, inner, red, green, blue, opacity, far)
         weight = tl.load(weights + n + 1, mask=inner, other=0.0)
         worth = tl.where(inner, weight * value, 0.0)
@@ -130,7 +130,7 @@ def backward(
         inside = (given >= 0) & (given <= opaque)
         left = tl.load(light + n, mask=live, other=0.0) * tl.exp(-tl.where(inside, given, 0.0))
         value = value_of(colour, distances, n, live, red, green, blue, opacity, far)
-        # Light that leaves the sample, against what all later samples lose as it thickens.
+        # Gain of this sample as its depth grows, minus the loss of all samples behind it.
         tl.store(d_depth + n, tl.where(inside, left * value - behind, 0.0), mask=live)
         weight = tl.load(weights + n, mask=live, other=0.0)
         tl.store(d_colour + 3 * n, weight * red, mask=live)

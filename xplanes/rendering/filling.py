@@ -1,4 +1,4 @@
-"""The occupancy grid of a field that already shows something."""
+"""The occupancy grid of an initialised field."""
 
 import math
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
 
 SOLID = 128
-"""Alpha from which a pixel must show something."""
+"""Alpha from which a pixel counts as foreground."""
 
 RAYS = 65536
-"""Rays that march together: all pixels of a large picture would fill the memory."""
+"""Rays that are marched together: all pixels of a large image would fill the memory."""
 
 
 def fill(
@@ -29,15 +29,15 @@ def fill(
     step: float,
     generator: torch.Generator,
 ) -> None:
-    """Keep the cells in which a field shows something, and those that must hold what it misses.
+    """Keep cells where the field has density, and cells where the images show that it lacks some.
 
-    A foreground pixel whose ray meets no cell that is left shows that something is missing: the
-    cells along that ray stay as they were. One pixel is looked at of each square that is no wider
-    than a cell in the image, and all pixels of squares beside which others differ.
+    If the ray of a foreground pixel meets no remaining cell, the field misses something there, and
+    all cells along that ray are restored. One pixel is tested per image square that is at most as
+    wide as a cell, and all pixels of squares whose neighbours give another result.
 
     Args:
-        grid: Changed in place; cells that are empty already stay so.
-        field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
+        grid: Changed in place; empty cells stay empty.
+        field: Maps points [N, 3] and times [N] to colour [N, 3] and density [N].
         views: Training views.
         frame: The field's frame.
         step: Distance between samples along rays.
@@ -48,8 +48,8 @@ def fill(
     kept = grid.occupied.clone()
     missing = torch.zeros_like(kept)
 
-    def look(index: int, pixels: Tensor) -> Tensor:
-        """Which pixels [K, 2] show something that is left; what others show is missing. bool [K]"""
+    def test(index: int, pixels: Tensor) -> Tensor:
+        """Whether the rays of pixels [K, 2] meet a remaining cell; marks missing cells. bool [K]"""
         chosen, (rows, columns) = torch.full_like(pixels[:, 0], index), pixels.float().unbind(dim=1)
         rays = frame.rays(*views.pixel_rays(chosen, rows, columns))
         time = views.times[index].to(kept.device)
@@ -68,26 +68,26 @@ def fill(
         solid = views.image(index)[..., 3] >= SOLID
         side = pixels_of_a_cell(views, index, frame, grid.resolution)
         pixels = one_of_each_square(solid, side)
-        met = look(index, pixels)
+        met = test(index, pixels)
         if side > 1:
             squares = torch.zeros([-(-length // side) for length in solid.shape])
             squares[tuple((pixels // side).T)] = 2 - met.float()
-            look(index, (solid & enlarged(differing(squares), side, solid.shape)).nonzero())
+            test(index, (solid & enlarged(differing(squares), side, solid.shape)).nonzero())
     missing &= ~kept
     grid.density[missing] = density[missing]
     grid.occupied |= missing
 
 
 def pixels_of_a_cell(views: Views, index: int, frame: Frame, resolution: int) -> int:
-    """Pixels along the side of a cell of the grid in image ``index``, where cells look smallest."""
+    """Pixels along the side of a grid cell in image ``index``, for the smallest projected cell."""
     away = (views.camera_to_world[index, :3, 3].double() - frame.centre.double()).norm()
-    corner = float(away) + math.sqrt(3) / frame.scale  # Of the cube, behind its centre.
+    corner = float(away) + math.sqrt(3) / frame.scale  # Distance of the cube's farthest corner.
     focal = float(views.intrinsics.focal[index].min())
     return max(1, int(focal * 2 / resolution / frame.scale / corner))
 
 
 def one_of_each_square(mask: Tensor, side: int) -> Tensor:
-    """One pixel of a mask, of each square that has any.
+    """One pixel of the mask in each square that contains any.
 
     Args:
         mask: Pixels to choose from. bool [H, W]
@@ -106,13 +106,13 @@ def one_of_each_square(mask: Tensor, side: int) -> Tensor:
 
 
 def differing(values: Tensor) -> Tensor:
-    """Where an image is above 0 and not all of the eight pixels around are equal. bool [H, W]"""
+    """Where an image is above 0 and differs among the pixel and its neighbours. bool [H, W]"""
     most, least = (F.max_pool2d(sign * values[None], 3, 1, 1)[0] * sign for sign in (1, -1))
     return (values > 0) & (most != least)
 
 
 def enlarged(mask: Tensor, factor: int, size: Sequence[int]) -> Tensor:
-    """A mask with squares in place of pixels, cut to a size. bool [h, w] -> bool [H, W]"""
+    """A mask enlarged by pixel replication and cropped to a size. bool [h, w] -> bool [H, W]"""
     mask = mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
     return mask[: size[0], : size[1]]
 

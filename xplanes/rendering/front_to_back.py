@@ -1,4 +1,4 @@
-"""Images from front to back: what an opaque surface hides is never asked for."""
+"""Front-to-back rendering of images, with early ray termination."""
 
 import math
 from typing import Any
@@ -12,10 +12,10 @@ from xplanes.rendering.compositing import OPAQUE
 from xplanes.rendering.marching import Samples
 
 AT_ONCE = 2**14
-"""Samples that the field is asked for together.
+"""Samples per evaluation of the field.
 
-Their features stay in the cache, and their memory is used again: beyond 32 MB the C library returns
-memory to the system each time, and clearing fresh pages takes longer than the arithmetic.
+Their features fit in the cache, and their memory is reused: above 32 MB the C library returns
+memory to the system each time, and clearing new pages takes longer than the arithmetic.
 """
 
 
@@ -28,19 +28,19 @@ def front_to_back(
     step: float,
     occlusion: float,
 ) -> Tensor:
-    """Sums over the samples of each ray, as `composite` gives them, without gradients, on the CPU.
+    """Sums over the samples of each ray as in `composite`, on the CPU and without gradients.
 
-    All rays go forward by a few samples at a time, and a ray ends once it is opaque. The result
-    does not depend on how many samples are taken at a time. The readable twin is `shade` and
+    All rays advance by a few samples at a time, and a ray ends once it is opaque. The result does
+    not depend on the number of samples at a time. The reference implementation is `shade` and
     `composite` on all samples; it differs by less than ``occlusion``.
 
     Args:
-        field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
-        samples: Where to ask it.
+        field: Maps points [N, 3] and times [N] to colour [N, 3] and density [N].
+        samples: Samples of the rays.
         times: Time of each ray. [R]
         directions: Unit direction of each ray. [R, 3]
         step: Length of a sample.
-        occlusion: Transmittance below which a ray ends; 0 ends none.
+        occlusion: Transmittance below which a ray ends; 0: never.
 
     Returns:
         Sums of weight times (colour, 1, distance). [R, 5]

@@ -28,30 +28,30 @@ from xplanes.settings import Count, Range, Share, Weight
 from xplanes.streams import Stream, TrainingState, counted_uniform, step_generator
 
 SPARE = 1.25
-"""Places for the samples of a batch, over their average."""
+"""Memory slots for the samples of a batch, relative to their average number."""
 
 STEP_OF_ROOM = 1024
-"""Their number is a multiple of this."""
+"""The number of slots is a multiple of this."""
 
 FEWEST_SAMPLES, SAMPLES_PER_PIXEL = 128, 0.5
-"""Samples along the diagonal, of which a step covers 3.5 pixels."""
+"""Samples along the diagonal: at least, and per image pixel along the cube's side."""
 
 SPARSE_POINTS = 2048
-"""Points at which the sparsity prior is taken."""
+"""Points at which the sparsity prior is evaluated."""
 
 DIAGONAL = 2 * math.sqrt(3)
-"""Longest way through the field's cube."""
+"""Length of the cube's diagonal."""
 
 BEHIND = 0.5
-"""How far behind the cube the distortion takes the background to be."""
+"""Distance behind the cube at which the distortion loss places the background."""
 
 
 @dataclass(frozen=True)
 class GridRendering(Rendering):
-    """What rays see through an occupancy grid.
+    """Rays rendered with an occupancy grid.
 
     Attributes:
-        distortion: As `compositing.distortion` gives it; None where nobody asked. []
+        distortion: Result of `compositing.distortion`; None if not computed. []
     """
 
     distortion: Tensor | None
@@ -59,18 +59,17 @@ class GridRendering(Rendering):
 
 @dataclass(frozen=True)
 class GridRenderer(RayRenderer):
-    """Renders rays through a field, skipping what cannot be seen.
+    """Renders rays through a field, and skips samples in empty cells or behind surfaces.
 
     Attributes:
-        grid: Which cells hold something, and when.
+        grid: The occupancy grid.
         samples: Steps along the diagonal of the field's cube.
         skip_empty: Skip samples in empty cells.
-        occlusion: Skip samples behind surfaces that leave less light than this; 0 skips none. The
-            grid tells; in images on the CPU the field itself does.
-        room: Places for samples where nothing may wait for their number, see `march`.
-        distorted: Whether to measure the distortion.
-        thinning: Samples whose gradient is below this times the mean may be left out, see
-            `thinned`.
+        occlusion: Transmittance below which samples are skipped; 0 skips none. Estimated from the
+            grid, except for images on the CPU, where it comes from the field.
+        room: Number of memory slots for samples, see `march`.
+        distorted: Whether to compute the distortion.
+        thinning: Subsample gradients below this times the mean, see `thinned`.
     """
 
     grid: OccupancyGrid
@@ -103,13 +102,13 @@ class GridRenderer(RayRenderer):
         """Render rays.
 
         Args:
-            field: From points and times to colour and density.
+            field: Maps points and times to colour and density.
             origins: Ray origins in the field's frame. [R, 3]
             directions: Unit directions. [R, 3]
             times: Time of each ray, from 0 to 1. [R]
             background: Colour behind the scene. [3] or [R, 3]
-            jitter: Place of each ray's samples within their steps; the middle when None. [R]
-            generator: Chooses the samples that carry gradients, see `thinned`; all when None.
+            jitter: Offset of each ray's samples within their steps; the middle when None. [R]
+            generator: Selects the samples that carry gradients, see `thinned`; all when None.
 
         Returns:
             One value per ray.
@@ -147,7 +146,7 @@ class GridRenderer(RayRenderer):
         )
         background = behind(field, origins, directions, total[:, 3], background, jitter)
         if samples.shown is not None:
-            # A ray without room sees nothing but the background, which must not learn from it.
+            # A ray without slots shows only the background, which must not learn from it.
             background = torch.where(samples.shown[:, None], background, background.detach())
         colour, opacity, depth = _pixels(total, background)
         spread = None
@@ -161,7 +160,7 @@ class GridRenderer(RayRenderer):
     def pixels(
         self, field: Any, origins: Tensor, directions: Tensor, times: Tensor, background: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """As `render`, without gradients; on the CPU front to back, until rays are opaque."""
+        """As `render`, without gradients; on the CPU with early ray termination."""
         if not cpu_loops(origins):
             return super().pixels(field, origins, directions, times, background)
         samples = march(
@@ -181,7 +180,7 @@ class GridRenderer(RayRenderer):
 
 
 def _pixels(total: Tensor, background: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour, opacity and depth from a ray's sums and what is behind it. [R, 5], [R, 3]"""
+    """Colour, opacity and depth from a ray's sums and its background. [R, 5], [R, 3]"""
     opacity = total[:, 3]
     colour = total[:, :3] + (1 - opacity)[:, None] * background
     return colour, opacity, total[:, 4] / opacity.clamp_min(1e-6)
@@ -194,8 +193,8 @@ Fraction = Annotated[float, Range(0, 1, open=True)]
 class OccupancySettings(SamplerSettings):
     """Equal steps along rays; samples that cannot contribute are skipped."""
 
-    # Samples along the diagonal of the cube in training. auto: half as many as a side of it covers
-    # image pixels, from 128 to 256; 128 in scenes with surroundings.
+    # Samples along the diagonal of the cube in training. auto: half the number of image pixels
+    # along its side, from 128 to 256; 128 in scenes with surroundings.
     samples: Count | Literal["auto"]
     render_samples: Count  # Samples along the diagonal in evaluation and videos.
     grid_resolution: Count  # Cells of the occupancy grid along each side.
@@ -210,15 +209,15 @@ class OccupancySettings(SamplerSettings):
     thinning: Weight  # Subsample gradients below this times the mean, on the CPU; 0: off.
     silhouettes: bool  # Prune cells outside the silhouettes (alpha).
     fill: bool  # Prune empty cells of an initialised field.
-    # Weight of the mean opacity of random points in occupied cells, one step long. It empties what
-    # no training ray sees, such as the space below a ground plate. 0 if a background is learnt,
-    # which would take over what it empties.
+    # Weight of the mean opacity per step of random points in occupied cells. It empties space that
+    # no training ray sees, such as that below a ground plate. 0 if a background is learnt, which
+    # would otherwise take over the emptied content.
     sparsity: Weight
-    # Weight of the distortion (Mip-NeRF 360), which turns fog into surfaces. 0 unless a background
-    # is learnt.
+    # Weight of the distortion loss (Mip-NeRF 360), which turns fog into surfaces. 0 unless a
+    # background is learnt.
     distortion: Weight
-    # Steps at which all occupied cells are updated; only the last one if a background is learnt,
-    # which would take over what lies in cells that are only late.
+    # Steps at which all occupied cells are updated. Only the last one if a background is learnt,
+    # which would take over the content of cells that are emptied too early.
     sweep_at: list[int]
     sweep_every: Count  # Steps between updates of all occupied cells afterwards.
     update_every: Count  # Steps between updates of random cells.
@@ -227,8 +226,8 @@ class OccupancySettings(SamplerSettings):
     def check(self) -> None:
         if self.occlusion >= 1:
             raise ConfigError(
-                f"occlusion={self.occlusion}: must be below 1, or no light counts as seen; 0.001 "
-                "is the default, skip_occluded=false skips nothing"
+                f"occlusion={self.occlusion}: must be below 1, or all samples are skipped; 0.001 "
+                "is the default, skip_occluded=false skips none"
             )
         if self.grid_resolution**3 * self.time_bins > 2**28:
             raise ConfigError(
@@ -266,9 +265,9 @@ class OccupancySettings(SamplerSettings):
         return OccupancySampler(renderer, settings, site.samples_per_batch, fill_seconds)
 
     def before_colour(self, site: Site) -> "OccupancySettings":
-        """What suits a plain background: the same schedule in steps of the batches of a site.
+        """Settings for a constant background: sweeps scaled to the batch size of a site.
 
-        Random cells are looked at as often as before, for rays of large batches meet more cells.
+        Updates of random cells are not scaled, because large batches reach more cells anyway.
         """
         return replace(
             self,
@@ -278,7 +277,7 @@ class OccupancySettings(SamplerSettings):
         )
 
     def before_background(self) -> "OccupancySettings":
-        """What leaves cells to the field until it has taken shape; large batches start small."""
+        """Settings for a learnt background: cells are not emptied early in training."""
         return replace(self, sweep_at=self.sweep_at[-1:], sparsity=0.0)
 
     def for_video(self) -> "OccupancySettings":
@@ -287,10 +286,10 @@ class OccupancySettings(SamplerSettings):
 
 
 def _fill(renderer: GridRenderer, field: RadianceField, site: Site) -> float:
-    """Fill the grid of an initialised field on the device where it is going to be trained.
+    """Fill the grid of an initialised field on its training device.
 
     Returns:
-        Seconds that it took; warm-up excluded.
+        Duration in seconds, warm-up excluded.
     """
     assert site.views is not None
     began = time.perf_counter() - warm_up.seconds
@@ -306,13 +305,13 @@ def _fill(renderer: GridRenderer, field: RadianceField, site: Site) -> float:
 
 
 class OccupancySampler(Sampler):
-    """Equal steps through occupied cells; the grid is kept up to date here.
+    """Equal steps through occupied cells; also updates the grid.
 
     Args:
         renderer: Its grid is changed in place.
-        settings: Upkeep of the grid.
-        samples: Samples of a batch on average at most; None if not known.
-        fill_seconds: Seconds that it took to fill the grid of an initialised field.
+        settings: Settings of the updates.
+        samples: Maximum average number of samples per batch; None if unknown.
+        fill_seconds: Seconds spent on filling the grid of an initialised field.
     """
 
     def __init__(
@@ -353,7 +352,7 @@ class OccupancySampler(Sampler):
         return min(most, 256)
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
-        # Elsewhere choosing costs more than what it saves.
+        # On other devices the selection costs more than it saves.
         thins = self.settings.thinning > 0 and self.device.type == "cpu"
         thins = thins and torch.is_grad_enabled() and isinstance(field, nn.Module)
         return self._training.render(
@@ -387,7 +386,7 @@ class OccupancySampler(Sampler):
             if gradient is None:
                 continue
             if distributed.is_available() and distributed.is_initialized():
-                distributed.all_reduce(gradient)  # Each process has points of its own.
+                distributed.all_reduce(gradient)  # Each process has its own points.
                 gradient /= distributed.get_world_size()
             if parameter.grad is None:
                 parameter.grad = gradient
@@ -405,12 +404,12 @@ class OccupancySampler(Sampler):
         points, times = self.grid.occupied_points(uniform.float())
         density = field(points, times)[1]
         opacity = -torch.expm1(-self._training.step * density)
-        # No cell may be occupied; other processes wait for the gradients all the same.
+        # Needed even if no cell is occupied: other processes wait for the gradients.
         return steps * self.settings.sparsity / SPARSE_POINTS * opacity.sum()
 
     @property
     def device(self) -> torch.device:
-        """Where the grid is."""
+        """Device of the grid."""
         return self.grid.density.device
 
     def update(self, field: Any, state: TrainingState) -> None:
@@ -430,7 +429,7 @@ class OccupancySampler(Sampler):
             self.grid.update(field, settings.update_cells, generator)
 
     def _agree(self) -> None:
-        """Go on with the first process's grid: each has seen the samples of its own rays."""
+        """Copy the first process's grid to all: each has observed only its own samples."""
         if distributed.is_available() and distributed.is_initialized():
             for part in (self.grid.density, self.grid.least, self.grid.occupied):
                 distributed.broadcast(part, src=0)
@@ -441,8 +440,8 @@ class OccupancySampler(Sampler):
             self._training = replace(self._training, room=room)
 
     def _room(self, samples: float) -> int:
-        """Places for batches with this number of samples on average; some batches have more."""
-        # A ray must find room, and few sizes let memory be used again.
+        """Slots for batches with this average number of samples; some batches have more."""
+        # At least one ray must fit; few different sizes allow memory to be reused.
         return STEP_OF_ROOM * math.ceil(max(SPARE * samples, 2 * self._along) / STEP_OF_ROOM)
 
     def scalars(self) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Placing samples along rays where the scene holds something."""
+"""Placement of samples along rays in occupied cells."""
 
 import functools
 import math
@@ -14,16 +14,16 @@ from xplanes.rendering.compositing import OPAQUE, depth_before
 from xplanes.rendering.occupancy import OccupancyGrid
 
 OUTSIDE = 3.0
-"""Coordinate of places without a sample, beyond the planes: nothing is read or added there."""
+"""Coordinate of unused slots, outside the planes: nothing is read or added there."""
 
 
 STEP_OF_TRIAL = 0.07
-"""Distance between samples where the kernel is tried."""
+"""Distance between samples in the kernel's trial."""
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Samples that reach the field, those of a ray side by side from front to back.
+    """Samples that reach the field; those of a ray are contiguous, from front to back.
 
     Attributes:
         ray: Ray of each sample, ascending. [N]
@@ -31,15 +31,15 @@ class Samples:
         points: Positions in the field's frame. [N, 3]
         distances: Distance from the ray's origin. [N]
         cells: Cell of the occupancy grid. [N]
-        candidates: Samples in the box before any was dropped.
+        candidates: Number of samples in the box before any were dropped.
         empty: Samples dropped because their cell is empty.
         occluded: Samples dropped because an opaque surface lies in front.
-        live: Where room was set apart for samples: which places hold one; None if all do. [N]
-        number: How many do. []
-        shown: Which rays found room; None if all did. [R]
+        live: With a fixed number of slots: which of them hold a sample; None if all do. [N]
+        number: Number of slots that hold a sample. []
+        shown: Rays whose samples fit the slots; None if all did. [R]
 
-    With ``live`` the other numbers of samples are tensors too, and the places without a sample lie
-    outside the cube, behind all others.
+    With ``live`` the other counts are tensors, too; unused slots come last, with points outside the
+    cube.
     """
 
     ray: Tensor
@@ -59,7 +59,7 @@ class Samples:
 
     @property
     def count(self) -> int | Tensor:
-        """Samples that there are; a tensor where only the device knows."""
+        """Number of samples; a tensor if it is not known on the host."""
         return len(self.ray) if self.number is None else self.number
 
 
@@ -81,15 +81,15 @@ def march(
         origins: Ray origins in the field's frame. [R, 3]
         directions: Unit directions. [R, 3]
         times: Time of each ray. [R]
-        jitter: Place of each ray's samples within their steps, from 0 to 1. [R]
-        grid: Tells which cells are empty.
+        jitter: Offset of each ray's samples within their steps, from 0 to 1. [R]
+        grid: The occupancy grid.
         step: Distance between samples.
         skip_empty: Whether samples in empty cells are dropped.
-        occlusion: Samples that the grid's least densities leave less light than this are dropped;
-            0 keeps all.
-        room: Places set apart for samples on a device other than the CPU, so that nothing waits for
-            their number. Rays without room are left out whole, and those behind them. None takes as
-            many as there are.
+        occlusion: Samples are dropped where the transmittance, by the grid's least densities, is
+            below this; 0 keeps all.
+        room: Fixed number of slots for samples on devices other than the CPU, so that the host need
+            not wait for their number. Rays that do not fit are left out, with all later ones. None
+            allocates as many as needed.
 
     Returns:
         The samples that remain.
@@ -117,7 +117,7 @@ def march_reference(
     occupied: Tensor | None,
     limit: float,
 ) -> Samples:
-    """The same as `march`, in whole-tensor operations."""
+    """Reference implementation of `march`, in whole-tensor operations."""
     near, far = ray_box(origins, directions)
     steps = int(((far - near).max() / step).ceil()) + 1 if len(near) else 0
     distances, cells, inside = _all_samples(
@@ -155,7 +155,7 @@ def _all_samples(
     step: float,
     steps: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Distances and cells of each ray's samples, and whether they lie in the cube. [R, S]"""
+    """Distances and cells of each ray's samples, and whether they are in the cube. [R, S]"""
     offset = torch.arange(steps, device=near.device, dtype=near.dtype) + jitter[:, None]
     distances = near[:, None] + offset * step
     half = 0.5 * grid.resolution
@@ -178,9 +178,9 @@ def march_into(
     limit: float,
     room: int,
 ) -> Samples:
-    """The same as `march_reference` into a fixed number of places, without waiting for the device.
+    """`march_reference` with a fixed number of slots, without waiting for the device.
 
-    Samples are counted, the counts summed up, and each place finds its sample by the sum.
+    Samples are counted; each slot finds its sample from the cumulative sum of the counts.
     """
     near, far = ray_box(origins, directions)
     rays, steps = len(near), math.ceil(2 * math.sqrt(3) / step) + 1
@@ -230,9 +230,9 @@ def march_gpu(
     limit: float,
     room: int | None,
 ) -> Samples:
-    """The same as `march_into`, or as `march_reference` without ``room``, in a Triton kernel.
+    """`march_into`, or without ``room`` `march_reference`, as a Triton kernel.
 
-    It runs twice, to count the samples of each ray and to write them down.
+    The kernel runs twice: to count the samples of each ray, and to write them.
     """
     gpu = gpu_module("xplanes.rendering.marching_triton")
     rays, device = len(origins), origins.device
@@ -275,7 +275,7 @@ def march_gpu(
 
 @functools.cache
 def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
-    """Whether the kernel proves itself on rays that enter, start inside and miss the cube."""
+    """Whether the kernel passes its trial on rays that enter, start inside and miss the cube."""
 
     def attempt(function: Callable[..., Samples], precision: torch.dtype) -> list[Tensor]:
         grid = OccupancyGrid(6, 3, step=STEP_OF_TRIAL).to(device)
@@ -302,7 +302,7 @@ def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
 
 def _starts(ray: Tensor, rays: int) -> Tensor:
     """Index of each ray's first sample. [N] -> [rays]"""
-    # Unlike counting, looking up in what is sorted needs no word from the device on its size.
+    # Unlike a count, a binary search does not wait for the device.
     return torch.searchsorted(ray, torch.arange(rays, device=ray.device))
 
 

@@ -1,9 +1,8 @@
-"""Triton kernels that place samples along rays on CUDA; `marching` holds the readable twin.
+"""Triton kernels that place samples along rays on CUDA; the reference is in `marching`.
 
-A program takes a ray and walks along it, a block of places at a time: once to count its samples,
-and once more, when all rays know where theirs begin, to write them down. Both come to the same
-numbers, since no product is fused with a sum. Imported only when needed, since triton takes a while
-to load.
+A program handles one ray, a block of positions at a time: first to count its samples, and again to
+write them once the offsets of all rays are known. Both passes get the same numbers, since no
+product is fused with a sum. Imported only when needed, since triton takes a while to load.
 """
 
 # ruff: noqa: D103 (the callers in marching.py document these kernels)
@@ -13,12 +12,12 @@ import triton
 import triton.language as tl
 
 BLOCK = 64
-"""Places that a program looks at once: two a thread."""
+"""Positions per block of a program: two per thread."""
 
 
 @triton.jit
 def within(value, size):
-    """The cell in which a place lies, or the nearest; the first for a NaN. int32"""
+    """Index of the cell of a position, clamped to the grid; 0 for a NaN. int32"""
     value = tl.where(value > 0, value, 0.0)
     return tl.where(value < size - 1, value, size - 1.0).to(tl.int32)
 
@@ -29,7 +28,7 @@ def slab(origin, direction):
     inverse = 1.0 / direction
     first, second = (-1.0 - origin) * inverse, (1.0 - origin) * inverse
     low, high = tl.minimum(first, second), tl.maximum(first, second)
-    # A ray that runs along a face is inside this slab.
+    # A ray within a face is inside this slab.
     unknown = (first != first) | (second != second)
     return tl.where(unknown, float("-inf"), low), tl.where(unknown, float("inf"), high)
 
@@ -63,7 +62,7 @@ def ray_box(origin, direction):
 
 
 @triton.jit
-def look(
+def cells_of(
     origin,
     direction,
     distance,
@@ -73,7 +72,7 @@ def look(
     size,
     SKIP: tl.constexpr,
 ):
-    """Cells of a block of places on a ray, and whether samples are wanted there."""
+    """Cells of a block of positions on a ray, and whether samples are placed there."""
     x, y, z = (
         origin[0] + distance * direction[0] + 1,
         origin[1] + distance * direction[1] + 1,
@@ -89,7 +88,7 @@ def look(
 
 @triton.jit
 def not_hidden(least, cell, wanted, step, limit, depth, opaque, LIMITED: tl.constexpr):
-    """Which of a block's samples lie in front of all opaque cells, and the depth behind them."""
+    """Which samples of a block are not occluded, and the optical depth behind the block."""
     if LIMITED:
         depths = tl.load(least + cell, mask=wanted, other=0.0).to(tl.float64) * step
         depths = tl.where(depths < opaque, depths, opaque)
@@ -128,7 +127,7 @@ def march(
     FILL: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Counts samples, or writes them down if FILL; ``counts`` is [3, rays]."""
+    """Counts samples, or writes them if FILL; ``counts`` is [3, rays]."""
     ray = tl.program_id(0)
     origin, direction = load_ray(origins, directions, ray)
     near, far = ray_box(origin, direction)
@@ -149,7 +148,7 @@ def march(
         n = first + tl.arange(0, BLOCK)
         distance = near + (n.to(near.dtype) + shift) * spacing
         inside = distance < far
-        cell, wanted = look(origin, direction, distance, time_bin, inside, occupied, size, SKIP)
+        cell, wanted = cells_of(origin, direction, distance, time_bin, inside, occupied, size, SKIP)
         shown, depth = not_hidden(least, cell, wanted, exact_step, limit, depth, opaque, LIMITED)
         number = shown.to(tl.int32)
         if FILL:
@@ -177,15 +176,15 @@ def march(
 
 
 def launch(rays, grid, spacing, counts, room, found=None):
-    """Launches `march`: to count, or with ``found`` to write down.
+    """Launches `march`: to count samples, or with ``found`` to write them.
 
     Args:
         rays: Origins, directions, times and jitter.
-        grid: Flags of cells to look into (None: all), least densities, resolution and time bins.
-        spacing: Distance of the places and largest optical depth in front, float64 [] each.
-        counts: Places in the cube, samples wanted, and those not hidden. int64 [3, R]
-        room: Places to write to.
-        found: Starts [R], then what is written: ray, distances, cells, points [N, ...].
+        grid: Occupied cells (None: all), least densities, resolution and time bins.
+        spacing: Distance between positions and largest optical depth in front, float64 [] each.
+        counts: Positions in the cube, those in occupied cells, and those not occluded. int64 [3, R]
+        room: Number of slots.
+        found: Starts [R], and the outputs: ray, distances, cells, points [N, ...].
     """
     number = len(rays[0])
     occupied, least, size, bins, opaque, limited = grid

@@ -1,4 +1,4 @@
-"""Where a scene holds anything, and when: a grid of cells over space and time."""
+"""The occupancy grid: cells over space and time, marked empty or occupied."""
 
 import torch
 import torch.nn.functional as F
@@ -8,28 +8,27 @@ from xplanes.rendering.box import Field
 from xplanes.rendering.compositing import OPAQUE
 
 TRUST = 0.1
-"""Share by which the least density of a cell rises towards what a look shows."""
+"""Rate at which the least density of a cell rises towards an observed density."""
 
 
 class OccupancyGrid(nn.Module):
-    """The density that the field last showed in each cell of the cube [-1, 1]^3 and each time bin.
+    """A decaying maximum of the field's density per cell of the cube [-1, 1]^3 and time bin.
 
-    A cell is occupied while its density could stop more than ``threshold`` of the light over one
-    sample step. Cells start as occupied and lose their density by ``decay`` at each look that does
-    not confirm it. Cells that are not ``allowed`` (silhouettes show them empty) never fill; those
-    that are not ``likely`` fill only beside an occupied cell.
+    A cell is occupied while the opacity of its density over one sample step is above ``threshold``.
+    Cells are initially occupied; each observation of a lower density multiplies theirs by
+    ``decay``. Cells that are not ``allowed`` (outside the silhouettes) stay empty; those that are
+    not ``likely`` can become occupied only next to an occupied cell.
 
-    ``least`` is what every recent look at a cell has shown: it falls to a smaller density at once
-    and rises slowly. A cell that a surface passes through, or a thing at some times of its bin,
-    has a high density but lets light through; only by ``least`` can it be told to hide what lies
-    behind it.
+    ``least`` is a running minimum of the observed densities: it falls at once and rises slowly. A
+    cell that a surface crosses, or that is filled at only some times of its bin, has a high density
+    but transmits light; only ``least`` tells whether it occludes the samples behind it.
 
     Args:
         resolution: Cells along each side.
         time_bins: Bins along time.
         step: Length of one sample, in the field's frame.
         threshold: Opacity of one sample step below which a cell counts as empty.
-        decay: Factor on a cell's density at each look.
+        decay: Factor on a cell's density at each observation.
     """
 
     density: Tensor
@@ -64,7 +63,7 @@ class OccupancyGrid(nn.Module):
         return (times * self.time_bins).long().clamp_(0, self.time_bins - 1)
 
     def cells(self, points: Tensor, times: Tensor) -> Tensor:
-        """Cell that holds each point of the cube at its time. [N, 3], [N] -> int64 [N]"""
+        """Cell of each point of the cube at its time. [N, 3], [N] -> int64 [N]"""
         place = (0.5 * self.resolution * (points + 1)).long().clamp_(0, self.resolution - 1)
         cells = self.bins(times)
         for axis in (2, 1, 0):
@@ -72,18 +71,18 @@ class OccupancyGrid(nn.Module):
         return cells
 
     def allow(self, allowed: Tensor) -> None:
-        """Rule out cells for good. bool [time_bins, G, G, G], axes z, y, x
+        """Exclude all other cells permanently. bool [time_bins, G, G, G], axes z, y, x
 
-        A cell that was ruled out before stays so, whatever ``allowed`` says.
+        Cells that were excluded before stay excluded, whatever ``allowed`` contains.
         """
         self.allowed.logical_and_(allowed.reshape(-1))
         self.density.mul_(self.allowed)
         torch.gt(self.density, self.empty_density, out=self.occupied)
 
     def presume(self, likely: Tensor) -> None:
-        """Empty all other cells; they fill only where what is occupied grows into them.
+        """Empty all other cells; they become occupied only next to occupied ones.
 
-        Elsewhere an untrained field would fill the air. Like `allow`.
+        Otherwise an untrained field would fill empty space. Shape and axes as in `allow`.
         """
         self.likely.logical_and_(likely.reshape(-1))
         self.density.mul_(self.likely)
@@ -96,17 +95,17 @@ class OccupancyGrid(nn.Module):
 
     @torch.no_grad()
     def observe(self, cells: Tensor, density: Tensor, live: Tensor | None = None) -> None:
-        """Take in the field's density at samples; cells ruled out stay empty.
+        """Update cells with the field's density at samples; excluded cells stay empty.
 
         Args:
             cells: Cell of each sample. [N]
             density: Density there. [N]
-            live: Which of them count, the first ones; all when None. [N]
+            live: Which samples count, a prefix of them; all when None. [N]
         """
         density = self._usable(density)
         if live is not None:
-            # The others repeat those that count, which changes nothing. If all repeated the same
-            # one, they would queue to write it.
+            # The others repeat those that count, without effect. They repeat different ones, as
+            # writes to a single cell would be serialised.
             one = torch.arange(len(live), device=live.device) % live.sum().clamp_min(1)
             cells = torch.where(live, cells, cells[one])
             density = torch.where(live, density, density[one])
@@ -122,15 +121,15 @@ class OccupancyGrid(nn.Module):
 
     @torch.no_grad()
     def sweep(self, field: Field, generator: torch.Generator, chunk: int | None = None) -> None:
-        """Look into every occupied cell once and empty those that show nothing.
+        """Evaluate every occupied cell once, and empty those without density.
 
-        A cell stays if it or a neighbour in space shows density at one random point and time, so
-        that a single look cannot lose a thin surface.
+        A cell is kept if it or a spatial neighbour has density at one random point and time, so
+        that a single observation cannot lose a thin surface.
 
         Args:
             field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
             generator: Source of randomness.
-            chunk: Points per call of the field; as many as suit the device when None.
+            chunk: Points per call of the field; chosen for the device when None.
         """
         device = self.density.device
         chunk = chunk or (2**15 if device.type == "cpu" else 2**19)
@@ -144,7 +143,7 @@ class OccupancyGrid(nn.Module):
             seen.view(1, self.time_bins, size, size, size), 3, stride=1, padding=1
         )
         keep = self.occupied & (around.view(-1) > self.empty_density)
-        # A cell kept for its neighbour's sake has one look to show something of its own.
+        # A cell kept because of a neighbour is emptied unless the next observation finds density.
         floor = self.empty_density / max(self.decay, 1e-3) * 1.001
         kept = seen.clamp_min(floor)
         lost = self.density.clamp_max(0.5 * self.empty_density)
@@ -154,14 +153,14 @@ class OccupancyGrid(nn.Module):
 
     @torch.no_grad()
     def update(self, field: Field, count: int, generator: torch.Generator) -> None:
-        """Look at random cells that samples do not reach, so that a wrong guess is corrected.
+        """Evaluate random cells, to find density in cells that are wrongly marked empty.
 
-        Half of them may lie anywhere, the other half beside occupied cells, where most of what is
-        missing is. Each is looked at in a random point at a random time.
+        Half of them are drawn from all cells, the other half next to occupied cells, where missing
+        content is most likely. Each is evaluated at a random point and time.
 
         Args:
             field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
-            count: Number of cells at most; of those drawn, some must stay empty and are left out.
+            count: Maximum number of cells; drawn cells that must stay empty are left out.
             generator: Source of randomness.
         """
         device = self.density.device
@@ -179,7 +178,7 @@ class OccupancyGrid(nn.Module):
 
     @torch.no_grad()
     def update_by(self, field: Field, uniform: Tensor) -> None:
-        """The same as `update` by given random numbers, without waiting for the device.
+        """`update` with given random numbers, without waiting for the device.
 
         Args:
             field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
@@ -198,12 +197,12 @@ class OccupancyGrid(nn.Module):
         self.observe(cells, field(points, times)[1], looked_at)
 
     def occupied_points(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
-        """Points and times in random occupied cells, by numbers from 0 to 1; none if all are empty.
+        """Random points and times in occupied cells; none if all cells are empty.
 
-        Off the CPU nothing waits for the number of these cells.
+        On a GPU the host does not wait for the number of occupied cells.
 
         Args:
-            uniform: The cell, the place in it along each axis, and the time. [N, 5]
+            uniform: Random numbers from 0 to 1 for cell, position along each axis, and time. [N, 5]
 
         Returns:
             [N, 3], [N]
@@ -228,7 +227,7 @@ class OccupancyGrid(nn.Module):
         return self._moved(cells, torch.randint(-1, 2, (3, count), generator=generator).to(device))
 
     def _moved(self, cells: Tensor, moves: Tensor) -> Tensor:
-        """Cells some steps away on each axis, within the grid. [N], [3, N] -> [N]"""
+        """Cells shifted along each axis, clamped to the grid. [N], [3, N] -> [N]"""
         size = self.resolution
         for stride, move in zip((1, size, size**2), moves, strict=True):
             place = torch.div(cells, stride, rounding_mode="floor") % size
@@ -247,11 +246,11 @@ class OccupancyGrid(nn.Module):
         return found
 
     def _usable(self, density: Tensor) -> Tensor:
-        """Densities up to opaque in one step, so that a cell can empty; NaN shows nothing."""
+        """Densities clamped to opaque in one step, so that cells can decay; NaN becomes 0."""
         return density.float().nan_to_num(0.0).clamp_max(self.opaque_density)
 
     def draw(self, cells: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
-        """Points and times in cells, by numbers from 0 to 1. [N], [N, 4] -> [N, 3], [N]"""
+        """Points and times in cells from uniform numbers. [N], [N, 4] -> [N, 3], [N]"""
         size = self.resolution
         index = torch.stack(
             [

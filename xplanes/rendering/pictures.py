@@ -13,11 +13,11 @@ from xplanes.files import replacing
 _RAMP = torch.tensor(
     [[13, 8, 135], [126, 3, 168], [204, 71, 120], [248, 149, 64], [240, 249, 33]]
 ).div(255)
-"""Five stops from dark blue over magenta to yellow, even in lightness."""
+"""Five colours from dark blue over magenta to yellow, evenly spaced in lightness."""
 
 
 def colour_map(values: Tensor) -> Tensor:
-    """Numbers from 0 to 1 as colours, dark to light. [...] -> [..., 3]"""
+    """Maps numbers from 0 to 1 to colours, from dark to light. [...] -> [..., 3]"""
     place = values.nan_to_num(0).clamp(0, 1) * (len(_RAMP) - 1)
     lower = place.long().clamp(max=len(_RAMP) - 2)
     ramp = _RAMP.to(values.device)
@@ -25,7 +25,7 @@ def colour_map(values: Tensor) -> Tensor:
 
 
 def depth_picture(depth: Tensor, opacity: Tensor) -> Tensor:
-    """Depth as colours, near is light, see-through is white. [H, W], [H, W] -> [H, W, 3]"""
+    """Depth as colours: near is light, transparent is white. [H, W], [H, W] -> [H, W, 3]"""
     seen = opacity > 0.5
     if not seen.any():
         return torch.ones(*depth.shape, 3)
@@ -85,6 +85,6 @@ def to_bytes(picture: Tensor) -> Tensor:
 
 
 def write_png(path: Path, picture: Tensor) -> None:
-    """Write a picture with colours from 0 to 1, whole or not at all. [H, W, 3]"""
+    """Write a picture with colours from 0 to 1 atomically. [H, W, 3]"""
     with replacing(path) as temporary:
         Image.fromarray(to_bytes(picture).numpy()).save(temporary, format="PNG")

@@ -1,4 +1,4 @@
-"""Compiled loops over rays on the CPU; `marching` and `compositing` hold the readable twins.
+"""Compiled loops over rays on the CPU; the references are in `marching` and `compositing`.
 
 Imported only when needed, since numba takes a second to load.
 """
@@ -13,7 +13,7 @@ from xplanes.backend import njit
 COMPILE = {"nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
 
 EXACT = {**COMPILE, "fastmath": False}
-"""For loops that must come to the same numbers twice: a fused product may round otherwise."""
+"""For loops that must reproduce the same numbers: a fused multiply-add rounds differently."""
 
 
 @njit(inline="always", **EXACT)
@@ -23,7 +23,7 @@ def cell(place, size):
 
 @njit(inline="always", **EXACT)
 def cell_to_sample(r, distance, start, slope, bins, occupied, size, skip):
-    """Index of the cell in which ray r is at a distance; -1 where no sample is wanted there."""
+    """Index of the cell of ray r at a distance; -1 if no sample is placed there."""
     x = cell(start[r, 0] + distance * slope[r, 0], size)
     y = cell(start[r, 1] + distance * slope[r, 1], size)
     z = cell(start[r, 2] + distance * slope[r, 2], size)
@@ -49,7 +49,7 @@ def count_samples(
     limit,
     counts,
 ):
-    """Candidates, samples in cells to look into, and those not behind a surface, for each ray."""
+    """Numbers of candidates, samples in occupied cells, and unoccluded samples of each ray."""
     for r in prange(len(near)):
         candidates, found, visible = 0, 0, 0
         depth = 0.0
@@ -127,7 +127,7 @@ def composite(optical_depth, colour, distances, starts, opaque, weights, total):
 
 @njit(parallel=True, **EXACT)
 def take_samples(rays, first, starts, points, distances, taken):
-    """Lay the next samples of some rays side by side."""
+    """Gather the next samples of some rays contiguously."""
     ray_taken, points_taken, distances_taken = taken
     for i in prange(len(rays)):
         end = starts[i + 1] if i + 1 < len(rays) else len(ray_taken)
@@ -140,7 +140,7 @@ def take_samples(rays, first, starts, points, distances, taken):
 
 @njit(parallel=True, **COMPILE)
 def composite_on(optical_depth, colour, distances, rays, starts, opaque, limit, before, total):
-    """Go on with `composite` on rays that stopped on the way, as far as a limit of depth."""
+    """Continue `composite` on rays with their next samples, up to a limit of optical depth."""
     for i in prange(len(rays)):
         r = rays[i]
         end = starts[i + 1] if i + 1 < len(rays) else len(optical_depth)
@@ -167,7 +167,7 @@ def composite_on(optical_depth, colour, distances, rays, starts, opaque, limit, 
 def composite_backward(
     optical_depth, colour, distances, starts, opaque, weights, gradient, d_depth, d_colour
 ):
-    """Gradients of `composite` by one walk from back to front along each ray."""
+    """Gradients of `composite` in one pass from back to front along each ray."""
     rays = len(starts)
     for r in prange(rays):
         end = starts[r + 1] if r + 1 < rays else len(optical_depth)
@@ -183,7 +183,7 @@ def composite_backward(
                 + gradient[r, 3]
                 + gradient[r, 4] * distances[n]
             )
-            # Light that leaves sample n, against what all later samples lose as it thickens.
+            # Gain of sample n as its depth grows, minus the loss of all samples behind it.
             d_depth[n] = np.exp(-before) * value - behind
             if optical_depth[n] < 0 or optical_depth[n] > opaque:
                 d_depth[n] = 0

@@ -21,10 +21,10 @@ from xplanes.streams import TrainingState
 logger = logging.getLogger(__name__)
 
 VIEWS_PER_ROW = 4
-"""Views of one timestep that a row of time for it alone needs."""
+"""Views of a timestep needed for it to have its own row of the time planes."""
 
 Group = dict[str, Any]
-"""Parameters of one learning rate: ``params``, ``lr`` and ``name``."""
+"""A parameter group of the optimiser: ``params``, ``lr`` and ``name``."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Site:
         times: Times of the training views, from 0 to 1. [V]
         seed: The run's seed.
         precision: Precision of matrix products: "32" or "bf16".
-        bounds: Least and largest corner of the field's box in the world; None for fields that need
+        bounds: Lower and upper corner of the field's box in the world; None for fields that need
             none. [2, 3]
         views: Training views; None if a checkpoint is loaded without its data.
         initialised: Whether the initial field already shows the scene.
@@ -86,10 +86,10 @@ class Site:
 
 
 def time_rows(times: Tensor) -> int:
-    """Rows of time where the settings leave them open.
+    """Default number of rows of the time planes.
 
-    One for two distinct times; one for each where there are enough views of it to tell what it
-    shows without its neighbours.
+    One per two distinct times, or one per time if each has enough views to be determined without
+    its neighbours.
 
     Args:
         times: Time of each training view. [V]
@@ -102,7 +102,7 @@ class Sampler(ABC):
     """Renders training batches, adds its own loss terms, and updates itself between steps."""
 
     fill_seconds: float = 0.0
-    """Seconds that building it took for an initialised field alone; part of the preparation."""
+    """Extra seconds of building it for an initialised field; they count as preparation."""
 
     @property
     @abstractmethod
@@ -125,7 +125,7 @@ class Sampler(ABC):
 
     @property
     def pruned_at(self) -> int:
-        """Step at which empty space is pruned first, so that rays take less time; 0 for never."""
+        """First step at which empty space is pruned, after which rays are cheaper; 0: never."""
         return 0
 
     def first_rays(self, most: int) -> int:
@@ -147,7 +147,7 @@ class Sampler(ABC):
         return {}
 
     def regularise(self, field: Any, state: TrainingState) -> None:
-        """Add the gradients of loss terms that need no rays to parameters, once an update.
+        """Add the gradients of loss terms that need no rays, once per optimiser step.
 
         Args:
             field: The field.
@@ -199,8 +199,8 @@ class SamplerSettings(Settings, ABC):
         """
         if not issubclass(field, self.kind):
             raise ConfigError(
-                f"model.sampler.name={self.name}: takes a {self.kind.__name__}, and the model's is "
-                f"a {field.__name__}; leave model/sampler out"
+                f"model.sampler.name={self.name}: takes a {self.kind.__name__}, but the model's "
+                f"field is a {field.__name__}; leave model/sampler out"
             )
 
     def require(self, field: Any) -> None:
@@ -219,7 +219,7 @@ class SamplerSettings(Settings, ABC):
 
         Args:
             field: The field.
-            site: What the field was built for.
+            site: Context for which the field was built.
 
         Raises:
             ConfigError, SceneError: If the sampler does not support this field or these cameras.
@@ -230,7 +230,7 @@ class SamplerSettings(Settings, ABC):
         return self
 
     def holds(self, near: float, far: float) -> bool:
-        """Whether samples reach a scene; true by default, for samplers without bounds of their own.
+        """Whether samples cover a scene; true by default, for samplers without near and far.
 
         Args:
             near: Least distance of the scene from a camera, in world units.
@@ -239,7 +239,7 @@ class SamplerSettings(Settings, ABC):
         return True
 
     def bounded(self, near: float, far: float) -> "SamplerSettings":
-        """The same with bounds for a scene; unchanged by default.
+        """The settings with bounds for a scene; unchanged by default.
 
         Args:
             near: As for `holds`.
@@ -249,17 +249,17 @@ class SamplerSettings(Settings, ABC):
 
 
 def scene_cube(views: Views, half_side: float | None, points: Tensor | None = None) -> Frame:
-    """The scene's own cube; ``half_side`` in world units, found when None, see `scene_frame`."""
+    """The scene's cube, see `scene_frame`; ``half_side`` in world units, estimated when None."""
     return scene_frame(views, half_side, points)
 
 
 def origin_cube(half_side: float, views: Views, given: float | None = None) -> Frame:
-    """A cube around the world's origin; says so where the scene looks to be of another size.
+    """A cube around the world's origin; warns if the scene seems to have another size.
 
     Args:
         half_side: Half the side of the cube, in world units.
         views: Training views.
-        given: Half the side of the scene's cube, which the settings must leave open.
+        given: ``data.half_side``, which must be None.
 
     Raises:
         ConfigError: If both are given.
@@ -267,7 +267,7 @@ def origin_cube(half_side: float, views: Views, given: float | None = None) -> F
     if given is not None:
         raise ConfigError(
             f"data.half_side={given} with model.half_side={half_side}: two cubes; set "
-            "model.half_side=null to use the former, or leave data.half_side out"
+            "model.half_side=null to use data.half_side, or leave data.half_side out"
         )
     try:
         scene = scene_frame(views, None)
@@ -284,18 +284,18 @@ def origin_cube(half_side: float, views: Views, given: float | None = None) -> F
 
 
 def fits_origin_cube(half_side: float, scene: Frame) -> bool:
-    """Whether a cube around the world's origin is of about the size of a scene.
+    """Whether a cube around the world's origin has about the size of a scene.
 
     Args:
         half_side: Half the side of the cube, in world units.
         scene: The scene's cube.
     """
-    # A scene that fills the cube's corners reaches sqrt(3) times as far as its sides.
+    # A scene that fills the cube's corners extends sqrt(3) times as far as its faces.
     return half_side / 4 < _reach(scene) < half_side * 3**0.5
 
 
 def _reach(scene: Frame) -> float:
-    """How far a scene reaches from the world's origin."""
+    """Largest distance of a scene from the world's origin."""
     return 1 / scene.scale + float(scene.centre.norm())
 
 
@@ -304,14 +304,14 @@ def seen_range(views: Views, scene: Frame) -> tuple[float, float]:
 
     Args:
         views: Training views.
-        scene: The scene's cube, whose inscribed ball holds its content.
+        scene: The scene's cube, whose inscribed ball contains the content.
     """
     away = (views.camera_to_world[:, :3, 3] - scene.centre).norm(dim=-1)
     return max(float(away.min()) - 1 / scene.scale, 0.0), float(away.max()) + 1 / scene.scale
 
 
 def check_range(site: Site, near: float, far: float) -> None:
-    """Refuse distances between which the cameras do not see the centre of the field's box.
+    """Refuse near and far if the centre of the field's box does not lie between them.
 
     Raises:
         ConfigError: With the cameras' distances.

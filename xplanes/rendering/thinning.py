@@ -1,4 +1,4 @@
-"""Gradients that matter: most samples need none."""
+"""Subsampling of gradients: most samples contribute little to them."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -8,25 +8,25 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 Shade = Callable[[Tensor | slice], tuple[Tensor, Tensor]]
-"""Colour [M, 3] and density [M] of some of the samples, given their indices."""
+"""Maps indices of samples to their colour [M, 3] and density [M]."""
 
 
 def thinned(
     shade: Shade, parameters: Sequence[Tensor], thinning: float, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Colour and density of all samples, whose gradients some samples carry for the others.
+    """Colour and density of all samples, with unbiased gradients from a random subset.
 
-    Most samples lie in thin air or behind what is seen; in a trained field a fifth of them holds
-    nine tenths of the gradient. A sample whose gradient has a size below a level, ``thinning``
-    times the mean, is taken along with probability size / level, its gradient multiplied by level /
-    size: what the field gets is right on average, and the field is asked again for these samples
-    alone. The size adds up the gradients of the colour and of the density's logarithm, which the
-    field's last layer feels.
+    Most samples lie in empty space or behind surfaces: in a trained field a fifth of them carry
+    nine tenths of the gradient. A sample whose gradient size is below a level, ``thinning`` times
+    the mean, is kept with probability size / level, and its gradient is multiplied by level / size.
+    The result is unbiased, and the backward pass evaluates the field for the kept samples only. The
+    size is the sum of the gradients of the colour and of the logarithm of the density, which are
+    those at the field's last layer.
 
     Args:
         shade: The field at the samples.
-        parameters: What gradients are wanted of.
-        thinning: 0 leaves no sample out.
+        parameters: Parameters that receive gradients.
+        thinning: Level relative to the mean; 0 keeps all samples.
         generator: Source of randomness.
 
     Returns:
@@ -54,16 +54,16 @@ class _Thinned(torch.autograd.Function):
         to_colour, to_density = gradients
         (density,) = ctx.saved_tensors
         size = to_colour.norm(dim=1) + (to_density * density).abs()
-        # A level that is not finite must hide no sample: training looks for what is not finite.
+        # With a level that is not finite all samples are kept, so that training detects the cause.
         level = (ctx.thinning * size.mean()).nan_to_num(0.0, 0.0, 0.0)
         draw = torch.rand(size.shape, generator=ctx.generator, dtype=size.dtype)
-        # Also true of a size that is NaN.
+        # The negated comparison also keeps samples whose size is NaN.
         chosen = (~(draw * level >= size)).nonzero()[:, 0]
         factor = (level / size[chosen]).clamp_min(1)
         with torch.enable_grad():
             found = ctx.shade(chosen)
         upstream = to_colour[chosen] * factor[:, None], to_density[chosen] * factor
-        # One of the two may be a constant.
+        # Colour or density may be constant.
         learnt = [pair for pair in zip(found, upstream, strict=True) if pair[0].requires_grad]
         given = torch.autograd.grad(
             [value for value, _ in learnt],

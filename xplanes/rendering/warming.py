@@ -1,4 +1,4 @@
-"""First calls of the inner loops, which load and compile them."""
+"""Warm-up of the inner loops: their first calls load and compile them."""
 
 import threading
 from collections.abc import Iterator
@@ -12,18 +12,18 @@ from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.box import Field
 
 PATIENCE = 3.0
-"""Seconds of warming up after which the user is told what takes so long."""
+"""Seconds of warm-up after which a message explains the delay."""
 
 
 @cache
 def say_why() -> None:
-    """Once in a process, though loops are warmed up at several places."""
+    """Print the message once per process."""
     print(f"compiling the inner loops: about {COMPILING} s ...", flush=True)
 
 
 @contextmanager
 def warming_up() -> Iterator[None]:
-    """Count what is done inside as warming up, and say so where it takes long."""
+    """Count the block as warm-up, and print a message if it takes long."""
     notice = threading.Timer(PATIENCE, say_why)
     notice.start()
     try:
@@ -35,7 +35,7 @@ def warming_up() -> Iterator[None]:
 
 @torch.no_grad()
 def render_one_ray(field: Field, renderer: RayRenderer) -> None:
-    """Render a ray from the middle of the cube, as a first call of all that pictures need."""
+    """Render a ray from the centre of the cube, to load and compile all loops for images."""
     with warming_up():
         device = renderer.device
         origin, direction = torch.zeros(1, 3, device=device), torch.eye(3, device=device)[:1]

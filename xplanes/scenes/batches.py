@@ -1,4 +1,4 @@
-"""Stateless ray batches: the step alone determines their content."""
+"""Stateless training batches: each depends only on the seed, the step and the rank."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
@@ -17,34 +17,34 @@ from xplanes.settings import Count, Settings, Share
 from xplanes.streams import Stream, counted_uniform, step_generator
 
 Batch = dict[str, Any]
-"""Tensors by name, one row for each ray; whole views have a ``camera`` besides."""
+"""Tensors by name, one row per ray; whole views also have a ``camera``."""
 
 NEAR_SILHOUETTE = 0.02
-"""Share of the image's side around silhouettes that counts as near."""
+"""Margin around silhouettes that counts as near, as a share of the image's side."""
 
 PLAIN_SHARE = 0.2
-"""Share of rays at opaque pixels whose surroundings have the same colour."""
+"""Share of rays drawn at opaque pixels without texture around them."""
 
 STILL_SHARE = 0.5
-"""Share of rays at pixels of fixed cameras where nothing changes."""
+"""Share of rays drawn at static pixels of fixed cameras."""
 
 PER_RUN = 32
-"""Rays from one run of pixels, of images in files."""
+"""Rays from one run of consecutive pixels, for images in files."""
 
 LEAST_RUNS = 32
-"""Runs of a batch at least, if it has as many rays."""
+"""Least number of runs per batch, if it has as many rays."""
 
 LARGEST_SHARE = 0.25
-"""Share of a GPU's free memory that images may take."""
+"""Largest share of a GPU's free memory for images."""
 
 AHEAD = 8
-"""Batches whose pixels the system is asked to read ahead."""
+"""Number of batches whose pixels are prefetched from the disk."""
 
 CPU_RAYS, CPU_SAMPLES = 1365, 8192
-"""Largest batch on the CPU under per_batch=auto, for which schedules in steps are made."""
+"""Largest batch on the CPU with per_batch=auto; schedules in steps assume this size."""
 
 GPU_RAYS, GPU_SAMPLES = 2**15, 2**19
-"""The same on a GPU, which small batches leave idle."""
+"""Largest batch on a GPU with per_batch=auto; small batches would leave it idle."""
 
 
 class Batches(ABC):
@@ -52,8 +52,8 @@ class Batches(ABC):
 
     Attributes:
         views: Training views.
-        rays: Rays of a batch.
-        skipped: Share of rays that uniform sampling would have drawn and this one does not.
+        rays: Number of rays per batch.
+        skipped: Share of the rays of uniform sampling that are not drawn.
     """
 
     views: Views
@@ -66,16 +66,16 @@ class Batches(ABC):
 
         Args:
             step: Its number.
-            rays: Rays to draw; as many as there may be when None.
+            rays: Number of rays to draw; the maximum when None.
         """
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatchSettings(Settings, ABC):
-    """What a training step is given."""
+    """Base class of the settings of training batches."""
 
     def on(self, device: torch.device) -> "BatchSettings":
-        """The same settings with each auto replaced by what suits a device."""
+        """The settings with each auto resolved for a device."""
         return self
 
     @property
@@ -96,7 +96,7 @@ class BatchSettings(Settings, ABC):
             views: Training views.
             frame: The field's frame.
             seed: The run's seed.
-            rank: Number of the process among those that split the rays.
+            rank: Rank of the process among those that split the rays.
         """
 
     @abstractmethod
@@ -106,10 +106,10 @@ class BatchSettings(Settings, ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class RaySettings(BatchSettings):
-    """Which rays a training step gets."""
+    """Settings of ray batches."""
 
-    # Maximum rays per batch. auto: 1365 on the CPU; 32768 on a GPU, with the schedules of X-Planes
-    # and of the occupancy grid shortened to 1/24.
+    # Maximum rays per batch. auto: 1365 on the CPU; 32768 on a GPU, where the schedules of X-Planes
+    # and of the occupancy grid are shortened to 1/24.
     per_batch: Count | Literal["auto"]
     # Maximum samples per batch, on average. auto: 8192 on the CPU, 524288 on a GPU.
     samples_per_batch: Count | Literal["auto"]
@@ -138,7 +138,7 @@ class RaySettings(BatchSettings):
         return RayBatches(views, frame, self, seed=seed, rank=rank)
 
     def fitting(self, rays: int, samples: int) -> int:
-        """As many as keep the samples near their maximum."""
+        """Rays that keep the number of samples near its maximum."""
         room = self.most_samples * rays / max(1, samples)
         return max(64, min(self.most, int(room)))
 
@@ -165,13 +165,13 @@ class ViewSettings(BatchSettings):
 
 
 class ViewBatches(Batches):
-    """Draws whole training views; each comes once before any comes again.
+    """Draws whole training views in random order, all of them once before any is repeated.
 
     Args:
         views: Training views.
-        settings: What lies behind them.
+        settings: The settings, with the background colour.
         seed: The run's seed.
-        rank: Number of this process among those that share the run.
+        rank: Rank of this process in a distributed run.
     """
 
     skipped = 0.0
@@ -185,9 +185,9 @@ class ViewBatches(Batches):
         """The view of a step.
 
         Returns:
-            Its ``camera``, and for each pixel, row by row: ``times`` [R], ``target`` colour before
-            ``background`` [R, 3] each, and ``alpha`` [R]. If some are not to be trained on, which
-            are ``shown``. bool [R]
+            Its ``camera``, and for each pixel, row by row: ``times`` [R], ``target`` colour on
+            ``background`` [R, 3] each, and ``alpha`` [R]. If some pixels are ignored, also
+            ``shown``, those that are not. bool [R]
         """
         turn, place = divmod(step, len(self.views))
         generator = step_generator(self.seed, turn, self.stream)
@@ -211,23 +211,23 @@ class ViewBatches(Batches):
 class RayBatches(Batches):
     """Draws training rays as a function of (seed, step, rank).
 
-    With ``skip_background`` rays far from the silhouettes are drawn at ``background_share`` instead
-    of at their share of the pixels. They show nothing but background; a few keep the air clear of
-    floaters. Space along those without any alpha counts as empty shortly before and after, too.
-    Opaque pixels of one colour with all around them, such as those of a white floor, have
-    `PLAIN_SHARE`. Opaque images of fixed cameras have no silhouettes, but pixels that change: the
-    others are drawn at `STILL_SHARE`, at their own times.
+    With ``skip_background``, pixels far from the silhouettes get ``background_share`` of the rays
+    instead of their share of the pixels. They show only background, and a few rays suffice to
+    prevent floaters. Space along rays with alpha 0 also counts as empty at slightly earlier and
+    later times. Opaque pixels without texture, such as those of a white floor, get `PLAIN_SHARE`.
+    In opaque images of fixed cameras, pixels that change take the role of silhouettes: the others
+    get `STILL_SHARE`, at their own times.
 
-    Of images in files each batch takes `PER_RUN` pixels of each of some runs of consecutive pixels,
-    so that it reads few places of the disk; every pixel is still as likely as any other. Near and
-    far are told apart more coarsely there (`RunPools`).
+    From images in files, each batch takes `PER_RUN` pixels from each of a few runs of consecutive
+    pixels, so that it reads from few places on the disk; all pixels remain equally likely. Near and
+    far are distinguished more coarsely there (`RunPools`).
 
     Args:
         views: Training views.
-        frame: The field's frame, in which rays are served.
-        settings: Which rays to draw.
+        frame: The field's frame, in which rays are returned.
+        settings: The settings.
         seed: The run's seed.
-        rank: Number of this process among those that split the rays.
+        rank: Rank of this process among those that split the rays.
     """
 
     def __init__(
@@ -243,7 +243,7 @@ class RayBatches(Batches):
             self.pools = RunPools(views, views.images, margins)
         else:
             if settings.skip_background and views.is_opaque:
-                changes = changing(views, margins)  # Large captures are drawn from evenly.
+                changes = changing(views, margins)  # Large captures are sampled uniformly.
             skips_plain = settings.skip_background and changes is None
             self.pools = PixelPools(
                 foreground(views, margins) if changes is None else changes,
@@ -269,11 +269,11 @@ class RayBatches(Batches):
 
         Args:
             step: Its number.
-            rays: Rays to draw; as many as there may be when None.
+            rays: Number of rays to draw; the maximum when None.
 
         Returns:
             ``origins`` and unit ``directions`` in the field's frame [R, 3], ``times`` [R],
-            ``target`` colour before ``background`` [R, 3] each, its ``alpha`` [R], and ``jitter``
+            ``target`` colour on ``background`` [R, 3] each, its ``alpha`` [R], and ``jitter``
             from 0 to 1 [R].
         """
         rays = rays or self.rays
@@ -299,7 +299,7 @@ class RayBatches(Batches):
     def _served(
         self, drawn: tuple[Tensor, ...], background: Tensor, move: Tensor | None, jitter: Tensor
     ) -> Batch:
-        """A batch of pixels, what lies behind them, and random numbers from 0 to 1."""
+        """The batch of drawn pixels, their background, and random numbers from 0 to 1."""
         far, view, row, column, colour = drawn
         origins, directions = self.views.pixel_rays(view, row.float(), column.float())
         origins, directions = self.frame.rays(origins, directions)
@@ -315,7 +315,7 @@ class RayBatches(Batches):
         }
 
     def _from_memory(self, images: Tensor, uniform: Tensor) -> tuple[Tensor, ...]:
-        """Far, view, row, column and colour of rays through scattered pixels. [R], [R, 4]"""
+        """Whether far, view, row, column and colour of independently drawn pixels. [R], [R, 4]"""
         assert isinstance(self.pools, PixelPools)
         far, pixel = self.pools.pick(uniform[:, 0], uniform[:, 1])
         height, width = self.views.height, self.views.width
@@ -325,7 +325,7 @@ class RayBatches(Batches):
     def _from_files(
         self, images: StoredImages, uniform: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, ...]:
-        """Far, view, row, column and colour of rays, some through each of few runs of pixels."""
+        """Whether far, view, row, column and colour of pixels drawn from a few runs."""
         assert isinstance(self.pools, RunPools)
         number, per_run = len(uniform), _per_run(len(uniform))
         far, view, run = self.pools.pick(*uniform[::per_run, :2].T)
@@ -336,10 +336,10 @@ class RayBatches(Batches):
         far, view = (each.repeat_interleave(per_run) for each in (far, view))
         width = self.views.intrinsics.size[view, 1]
         drawn = far, view, pixel // width, pixel % width, colour
-        return tuple(each[:number] for each in drawn)  # The last run may have to give fewer.
+        return tuple(each[:number] for each in drawn)  # The last run may be used only in part.
 
     def _prefetch(self, step: int, rays: int) -> None:
-        """Ask the system to read the runs of the next batches ahead, each once."""
+        """Prefetch the runs of the next batches, each once."""
         assert isinstance(self.views.images, StoredImages)
         assert isinstance(self.pools, RunPools)
         if not step <= self._prefetched <= step + AHEAD:
@@ -352,7 +352,7 @@ class RayBatches(Batches):
         self._prefetched = step + AHEAD
 
     def _times(self, view: Tensor, empty: Tensor, move: Tensor | None) -> Tensor:
-        """Times of rays, those through empty space moved. int64 [R], bool [R], [R] -> [R]"""
+        """Times of rays, jittered for those through empty space. int64 [R], bool [R], [R] -> [R]"""
         times = self.views.times[view]
         if move is None:
             return times
@@ -361,15 +361,15 @@ class RayBatches(Batches):
 
 
 class DeviceBatches(RayBatches):
-    """Batches drawn where the images lie, on a GPU: nothing is copied there, and nothing waits.
+    """Batches drawn on the GPU that holds the images: without transfers or synchronisation.
 
-    Like those of `RayBatches` they are a function of (seed, step, rank), of the same distribution;
-    the random numbers are others, each made from its own place (`counted_uniform`), so that they
-    are the same on every device.
+    As in `RayBatches` they are a function of (seed, step, rank), with the same distribution. The
+    random numbers differ: each is computed from its index (`counted_uniform`), so that they are the
+    same on every device.
 
     Args:
-        batches: What to draw, from pinhole images in memory.
-        device: Where.
+        batches: Batches of pinhole images in memory.
+        device: Device of the images.
     """
 
     def __init__(self, batches: RayBatches, device: torch.device) -> None:
@@ -382,7 +382,7 @@ class DeviceBatches(RayBatches):
 
     @staticmethod
     def can_serve(batches: RayBatches, device: torch.device) -> bool:
-        """Whether these rays can be drawn on a device, and their images have room there."""
+        """Whether these batches can be drawn on a device, and their images fit its memory."""
         views = batches.views
         if device.type == "cpu" or views.is_stored or views.intrinsics.lenses is not None:
             return False
@@ -404,5 +404,5 @@ class DeviceBatches(RayBatches):
 
 
 def _per_run(rays: int) -> int:
-    """Rays of a batch from one run of pixels."""
+    """Number of rays from one run of pixels, for a batch of ``rays``."""
     return max(1, min(PER_RUN, rays // LEAST_RUNS))

@@ -1,4 +1,4 @@
-"""Cameras in the convention of D-NeRF files: rays of pixels, and pixels of points.
+"""Cameras in the convention of D-NeRF files: rays through pixels, and projection of points.
 
 Camera axes are OpenGL's: x right, y up, looking along -z. Pixel centres lie at +0.5.
 """
@@ -19,7 +19,7 @@ def focal_length(angle_x: float, width: float) -> float:
 
 @dataclass(frozen=True)
 class PosedCamera:
-    """A camera somewhere in the world, and the size of its image.
+    """A camera with pose, intrinsics and image size.
 
     Attributes:
         camera_to_world: Its pose. [4, 4]
@@ -55,7 +55,7 @@ class PosedCamera:
         )
 
     def to(self, device: torch.device) -> "PosedCamera":
-        """The same: cameras stay on the CPU when Lightning moves a batch."""
+        """Returns the camera itself: it stays on the CPU when Lightning moves a batch."""
         return self
 
 
@@ -68,9 +68,9 @@ def cast_rays(
     centre: Tensor | tuple[float, float],
     lenses: Lenses | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Cast one ray through each named pixel.
+    """Cast one ray through each given pixel.
 
-    Where a lens maps no direction to a pixel, the ray is the one nearest to it.
+    If a lens maps no direction to a pixel, the nearest ray is used.
 
     Args:
         camera_to_world: Pose of the camera of each ray. [R, 4, 4] or [4, 4]
@@ -81,8 +81,8 @@ def cast_rays(
         lenses: One for each ray, or one for all; pinholes when None.
 
     Returns:
-        Origins and unit directions in the world, computed in double precision where lenses bend
-        them and returned in that of ``rows``. [R, 3], [R, 3]
+        Origins and unit directions in the world, computed in double precision for distorting
+        lenses, and returned in that of ``rows``. [R, 3], [R, 3]
     """
     rotation = camera_to_world[..., :3, :3]
     if lenses is not None:
@@ -102,9 +102,9 @@ def cast_rays(
 
 
 def turned(points: Tensor, rotation: Tensor) -> Tensor:
-    """Points times a rotation, or each times its own; [..., 3] by [3, 3] or [..., 3, 3].
+    """Rotate points, all by one rotation or each by its own; [..., 3] by [3, 3] or [..., 3, 3].
 
-    Not a matrix product, whose factors a GPU may round to 10 bits (TF32): half a pixel at 800.
+    Without a matrix product, which a GPU may compute in TF32: an error of half a pixel at 800 px.
     """
     x, y, z = (points[..., i : i + 1] for i in range(3))
     return (rotation[..., 0] * x).addcmul_(rotation[..., 1], y).addcmul_(rotation[..., 2], z)
@@ -137,7 +137,7 @@ def project(
     centre: Tensor,
     lenses: Lenses | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The pixels at which a camera sees points; the inverse of `cast_rays`.
+    """Project points to pixels; the inverse of `cast_rays`.
 
     Args:
         camera_to_world: Pose of the camera. [4, 4]
@@ -147,9 +147,9 @@ def project(
         lenses: The camera's lens; a pinhole when None.
 
     Returns:
-        Distances in pixels from the image's left and top edges, at +0.5 in the middle of a row or
-        column, [N] each, and whether the camera can see each point, inside its image or beyond,
-        bool [N]. The distances of other points are meaningless.
+        Pixel coordinates from the image's left and top edges, with pixel centres at +0.5, [N] each,
+        and whether the point projects to the image plane, inside the image or outside, bool [N]. If
+        not, its coordinates are meaningless.
     """
     local = camera_axes(camera_to_world, points)
     (focal_x, focal_y), (centre_x, centre_y) = focal.unbind(-1), centre.unbind(-1)
@@ -171,15 +171,15 @@ def ball_extent(
     lenses: Lenses | None = None,
     stretch: float = 1.0,
 ) -> Tensor:
-    """How far a ball around each point reaches from its centre in an image, on either axis.
+    """Extent of a ball around each point in an image, from its centre along either axis.
 
     Args:
         camera_to_world: Pose of the camera. [4, 4]
         points: Centres in the world. [N, 3]
-        radius: Of the balls, in world units.
+        radius: Radius of the balls, in world units.
         focal: Focal lengths along x and y in pixels. [2]
         lenses: The camera's lens; a pinhole when None.
-        stretch: Most by which the lens moves two points of the image apart (`Sight.stretch`).
+        stretch: Largest magnification by the lens's distortion (`Sight.stretch`).
 
     Returns:
         Upper bounds in pixels; infinity for balls that the camera touches. [N]
@@ -207,7 +207,7 @@ def _pair(value: Tensor | tuple[float, float] | float) -> tuple[Tensor | float, 
 
 
 def _like(reference: Tensor, value: Tensor | float) -> Tensor | float:
-    """Intrinsics in the precision of rays, which they would widen otherwise."""
+    """Intrinsics in the precision of rays, which they would otherwise promote."""
     return value.to(reference) if isinstance(value, Tensor) else value
 
 
@@ -216,10 +216,10 @@ def look_at(position: Tensor, target: Tensor | None = None) -> Tensor:
 
     Args:
         position: Camera centres. [N, 3]
-        target: Points looked at; the origin when None. [N, 3] or [3]
+        target: Points at which they look; the origin when None. [N, 3] or [3]
 
     Returns:
-        Poses; a camera straight above or below its target takes world y as up. [N, 4, 4]
+        Poses; for a camera directly above or below its target, up is world y. [N, 4, 4]
     """
     backward = position if target is None else position - target
     backward = backward / backward.norm(dim=-1, keepdim=True)
@@ -244,8 +244,8 @@ def upright(up_vectors: Tensor) -> Tensor | None:
         up_vectors: Unit vectors, one for each camera. [V, 3]
 
     Returns:
-        The rotation, in double precision, [3, 3]; None where the cameras agree on no up vector, as
-        where they look down on the scene from all headings.
+        The rotation, in double precision, [3, 3]; None if the up vectors cancel out, such as for
+        cameras that look straight down with all headings.
     """
     up = up_vectors.double().mean(dim=0)
     length = up.norm()
@@ -253,7 +253,7 @@ def upright(up_vectors: Tensor) -> Tensor | None:
         return None
     x, y, z = (up / length).tolist()
     if z < 0:
-        # Half a turn about x comes first: close to half a turn, the smallest rotation is ill-posed.
+        # Rotate by 180 degrees about x first: near 180 degrees the smallest rotation is ill-posed.
         flip = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
         return _upward(x, -y, -z) @ flip
     return _upward(x, y, z)
@@ -277,9 +277,9 @@ def camera_around(
 
     Args:
         azimuth: In degrees, from the world's x axis towards y.
-        elevation: Height angle above the horizontal plane, in degrees.
-        distance: From the target, in world units.
-        target: World point in the middle. [3]
+        elevation: Elevation above the horizontal plane, in degrees.
+        distance: Distance from the target, in world units.
+        target: World point at the image centre. [3]
 
     Returns:
         Camera-to-world matrix in double precision. [4, 4]
@@ -299,11 +299,11 @@ def orbit(count: int, *, radius: float, elevation: float, target: Tensor | None 
     Args:
         count: Number of cameras.
         radius: Distance to the target, in world units.
-        elevation: Height angle above the horizontal plane, in degrees.
-        target: World point in the middle. [3]
+        elevation: Elevation above the horizontal plane, in degrees.
+        target: World point at the image centre. [3]
 
     Returns:
-        Camera-to-world matrices; the first camera stands on the -y side. [count, 4, 4]
+        Camera-to-world matrices; the first camera is on the -y side. [count, 4, 4]
     """
     azimuth = torch.arange(count) * (2 * math.pi / max(count, 1)) - 0.5 * math.pi
     height = math.radians(elevation)

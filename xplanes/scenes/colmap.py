@@ -1,4 +1,4 @@
-"""Captures that COLMAP has registered: a sparse model and its images."""
+"""Captures registered with COLMAP: a sparse model and its images."""
 
 import csv
 import io
@@ -37,7 +37,7 @@ from xplanes.settings import Location
 logger = logging.getLogger(__name__)
 
 USUAL = "images"
-"""Folder of images where nobody names another."""
+"""Default folder of images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class ColmapSettings(CaptureSettings):
     model: Location | None  # Folder of the COLMAP model; null: sparse/0, sparse or colmap/sparse/0.
     images: Location  # Folder of the images that COLMAP was run on.
     # Folder of masks: NAME.png for each image NAME, black outside the foreground; null for none.
-    # Masks that hid moving objects from COLMAP would hide them here, too.
+    # Masks that removed moving objects for COLMAP would remove them here, too.
     masks: Location | None
     # Times of the images: a CSV file with the columns file and time; rank: the order within each
     # camera's folder; null: the numbers in the file names.
@@ -68,7 +68,7 @@ class ColmapSettings(CaptureSettings):
             return False
         if find_model(folder, MODELS[:2]) is not None:
             return True
-        # What transforms.json was made of is not what is to be read.
+        # If the model was converted to transforms.json, that is to be read.
         others = any(folder.glob("transforms*.json")) or (folder / "dataset.json").is_file()
         return not others and len(models_inside(folder)) == 1
 
@@ -77,8 +77,8 @@ class ColmapSettings(CaptureSettings):
             return
         if self.times is not None:
             raise ConfigError(
-                f"time_pattern={self.time_pattern}: file names tell no times where "
-                f"times={self.times}; set one of both to null"
+                f"time_pattern={self.time_pattern}: file names tell no times with "
+                f"times={self.times}; set one of the two to null"
             )
         try:
             groups = re.compile(self.time_pattern).groups
@@ -98,7 +98,7 @@ class ColmapSettings(CaptureSettings):
             raise self.no_scene()
         source = _model_folder(self.folder, self.model)
         if "test" in splits and not self.test_cameras:
-            # This needs no reading of the model and the images.
+            # Checked before the model and the images are read.
             raise MissingSplitError(
                 f"{source} has no test split. Name the folders of some cameras in "
                 "data.test_cameras, or choose another data.eval_split."
@@ -157,7 +157,7 @@ class ColmapSettings(CaptureSettings):
     def _times(
         self, names: Sequence[str], labels: Sequence[str], present: set[str]
     ) -> tuple[list[float], str]:
-        """Times from 0 to 1, and where they come from; none where the scene is static."""
+        """Times from 0 to 1, and their source; no times if the scene is static."""
         if self.static:
             return [], ""
         if self.times is None:
@@ -235,7 +235,7 @@ def _model_folder(folder: Path, name: str | None) -> Path:
 
 
 def _camera(name: str) -> str:
-    """The folder of an image, which holds those of one camera; empty where there is none."""
+    """The folder of an image, which contains those of one camera; empty if it is in none."""
     folder = PurePosixPath(name).parent.as_posix()
     return "" if folder == "." else folder
 
@@ -243,8 +243,8 @@ def _camera(name: str) -> str:
 def _image_folder(folder: Path, name: str, model: SparseModel) -> Path:
     """The folder of the images of a model.
 
-    The one of that name beside the model or above it; else the only one in the scene's folder that
-    has the images, such as input.
+    This is the folder of that name beside the model or above it, else the only folder of the scene
+    that contains the images, such as input.
 
     Raises:
         SceneError: If there is none.
@@ -272,7 +272,7 @@ def _image_folder(folder: Path, name: str, model: SparseModel) -> Path:
 
 
 def _matched(names: Sequence[str], labels: Sequence[str], pattern: str) -> list[float]:
-    """The number in each name that is a pattern's group."""
+    """The number in each name that matches the pattern's group."""
     found: list[float] = []
     for name, label in zip(names, labels, strict=True):
         match = re.search(pattern, name)
@@ -285,27 +285,27 @@ def _matched(names: Sequence[str], labels: Sequence[str], pattern: str) -> list[
         found.append(number)
     if len(names) > 1 and len(set(found)) == 1:
         raise SceneError(
-            f"The names of all {len(names)} images, such as {names[0]}, give the number {found[0]} "
-            f"for their time. {OTHER_TIMES}"
+            f"The names of all {len(names)} images, such as {names[0]}, contain the same time, "
+            f"{found[0]}. {OTHER_TIMES}"
         )
     return found
 
 
 def _ranks(names: Sequence[str], present: set[str]) -> list[float]:
-    """The place of each image in its folder, images that COLMAP did not register included."""
+    """The rank of each image in its folder, counting images that COLMAP did not register."""
     folders: dict[str, list[str]] = defaultdict(list)
     for name in present | set(names):
         folders[_camera(name)].append(name)
     places: dict[str, float] = {}
     for inside in folders.values():
-        # frame_10 comes after frame_9.
+        # In natural order, frame_10 comes after frame_9.
         inside.sort(key=natural)
         places |= {name: place for place, name in enumerate(inside)}
     counts = {len(folders[_camera(name)]) for name in names}
     if len(counts) > 1:
         logger.warning(
-            "The cameras' folders hold %d to %d images. Those of one rank are taken to show one "
-            "time: if frames are missing, set data.times to a CSV file",
+            "The cameras' folders hold %d to %d images. Images of equal rank are treated as "
+            "simultaneous: if frames are missing, set data.times to a CSV file",
             *(min(counts), max(counts)),
         )
     return [places[name] for name in names]

@@ -1,7 +1,7 @@
 """COLMAP's sparse models: cameras, images and points, from binary and text files.
 
-The files are read here, not by pycolmap: given a truncated file, its version 4.2 hangs, takes all
-memory or returns wrong cameras, and its errors do not name the file.
+The files are read here because pycolmap 4.2 hangs, takes all memory or returns wrong cameras for a
+truncated file, and its errors do not name the file.
 """
 
 import math
@@ -46,7 +46,7 @@ DEEPEST = 3
 """Levels of folders in which models are searched for, as in dense/0/sparse."""
 
 UNIT_TOLERANCE = 1e-2
-"""By how much the length of a quaternion may differ from 1."""
+"""Largest deviation of a quaternion's length from 1."""
 
 CAMERA = struct.Struct("<IiQQ")
 IMAGE = struct.Struct("<I7dI")
@@ -90,7 +90,7 @@ class SparseModel:
 
 
 def find_model(folder: Path, names: Sequence[str] = MODELS) -> Path | None:
-    """The first of some folders inside ``folder`` that holds a sparse model."""
+    """The first of the named folders inside ``folder`` that contains a sparse model."""
     for name in names:
         if any((folder / name / f"cameras.{end}").is_file() for end in ("bin", "txt")):
             return folder / name
@@ -109,13 +109,13 @@ def models_inside(folder: Path) -> list[Path]:
 
 
 def read_model(folder: Path) -> SparseModel:
-    """Read and check a sparse model, from binary files where there are both kinds.
+    """Read and check a sparse model; binary files take precedence over text files.
 
     Args:
         folder: Folder of cameras, images and points3D, each .bin or .txt.
 
     Raises:
-        SceneError: If a file is missing, damaged, or has a lens that is not read.
+        SceneError: If a file is missing, damaged, or has a lens that is not supported.
     """
     cameras_path, images_path = _part(folder, "cameras"), _part(folder, "images")
     cameras: dict[int, Calibration] = {}
@@ -150,7 +150,7 @@ def read_model(folder: Path) -> SparseModel:
 
 
 def _found(folder: Path, name: str) -> Path | None:
-    """A part of a model; the binary file where there are both kinds."""
+    """A file of a model; the binary one takes precedence."""
     paths = (folder / f"{name}.{end}" for end in ("bin", "txt"))
     return next((path for path in paths if path.is_file()), None)
 
@@ -165,21 +165,21 @@ def _part(folder: Path, name: str) -> Path:
 
 
 class _Binary:
-    """A binary file, read from its front."""
+    """A binary file, read sequentially."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
         self.path, self.file = path, file
         self.length = os.fstat(file.fileno()).st_size
 
     def take(self, kind: struct.Struct, what: str) -> tuple:
-        """The next values, which are those of ``what``."""
+        """The next values; ``what`` describes them for messages."""
         content = self.file.read(kind.size)
         if len(content) < kind.size:
             raise self._truncated(what)
         return kind.unpack(content)
 
     def text(self, what: str) -> str:
-        """The next text, up to a byte of 0."""
+        """The next null-terminated string."""
         letters = bytearray()
         while (letter := self.file.read(1)) != b"\0":
             if not letter:
@@ -188,7 +188,7 @@ class _Binary:
         return os.fsdecode(bytes(letters))
 
     def skip(self, count: int, what: str) -> None:
-        """Pass over bytes of ``what``."""
+        """Skip bytes of ``what``."""
         if count > self.length - self.file.tell():
             raise self._truncated(what)
         self.file.seek(count, os.SEEK_CUR)
@@ -225,11 +225,11 @@ def _binary(path: Path) -> Iterator[_Binary]:
 
 
 HEADER = 4096
-"""Bytes at the beginning of a text file that hold its comments."""
+"""Number of bytes at the beginning of a text file that contain its comments."""
 
 
 def _text_lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Lines that are no comments, each with its label."""
+    """Lines that are not comments, each with its label."""
     require_fetched(path)
     try:
         text = decoded(path.read_bytes())
@@ -243,7 +243,7 @@ def _text_lines(path: Path) -> Iterator[tuple[str, str]]:
 def _parsed(
     label: str, line: str, kind: str, parse: Callable[[list[str]], Parsed], most: int = -1
 ) -> Parsed:
-    """What ``parse`` makes of a line's words; the last word holds all after ``most``."""
+    """Result of ``parse`` for a line's words, split at most ``most`` times."""
     try:
         return parse(line.split(maxsplit=most))
     except (ValueError, IndexError, OverflowError) as problem:
@@ -292,9 +292,9 @@ def _images(path: Path) -> Iterator[tuple[str, np.ndarray, int]]:
 
     count = 0
     for label, line in _text_lines(path):
-        # Every other line, which some programs leave out, holds three values for each point seen.
+        # Every other line has three values per observed point; some programs leave it out.
         words = line.split()
-        # The name of an image stands among the first twelve words, and such lines are long.
+        # It has only numbers, whereas an image's line has a name among its first twelve words.
         if len(words) % 3 == 0 and all(number_in(word) is not None for word in words[:12]):
             continue
         # Names may contain spaces.
@@ -389,7 +389,7 @@ def _calibration(
 
 
 def _pose(label: str, motion: Sequence[float]) -> np.ndarray:
-    """A camera-to-world matrix from a world-to-camera quaternion, real part first, and shift."""
+    """Camera-to-world matrix from a world-to-camera quaternion, real part first, and shift."""
     values = np.array(motion, dtype=np.float64)
     length = math.hypot(*values[:4])
     if not np.isfinite(values).all() or abs(length - 1) > UNIT_TOLERANCE:

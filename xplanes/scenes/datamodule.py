@@ -30,7 +30,7 @@ UNIFORM = RaySettings(
     background_share=1.0,
     background_jitter=0.0,
 )
-"""Rays for a LightningModule that does not specify any."""
+"""Batches for a LightningModule that does not specify any."""
 
 
 class SceneDataModule(LightningDataModule):
@@ -44,8 +44,8 @@ class SceneDataModule(LightningDataModule):
     as many rays as the training views have pixels.
 
     `val_dataloader`, `test_dataloader` and `predict_dataloader` serve one whole view per batch, see
-    `whole_view`. Validation views come in an order whose first ones, however many, are spread
-    evenly (`limit_val_batches`). Several processes share the views.
+    `whole_view`. Validation views are ordered so that any number of first ones is evenly spread
+    (`limit_val_batches`). Several processes share the views.
 
     Args:
         scene: Settings of the scene, or the group ``data`` of a configuration.
@@ -71,21 +71,21 @@ class SceneDataModule(LightningDataModule):
     def _begin(self, settings: SceneSettings, seed: int) -> None:
         self.settings, self.seed = settings, seed
         self.first = 0
-        """Batches that training has drawn already."""
+        """Number of batches already drawn."""
         self.held_out = 0
-        """Training views that serve for validation, because the scene has no split for it."""
+        """Training views held out for validation, if the scene has no split for it."""
         self._scene: Scene | None = None
         self._batches: dict[int, Batches] = {}
 
     @property
     def rays(self) -> int | None:
-        """Rays of the next batch, if the LightningModule sets them (``rays``)."""
+        """Number of rays in the next batch, if the LightningModule sets it (``rays``)."""
         module = None if self.trainer is None else self.trainer.lightning_module
         return getattr(module, "rays", None)
 
     @classmethod
     def of(cls, scene: Scene, *, seed: int = 0) -> "SceneDataModule":
-        """Build from a scene that is already loaded, whatever its source.
+        """Build from a loaded scene of any source.
 
         Args:
             scene: The scene.
@@ -137,7 +137,7 @@ class SceneDataModule(LightningDataModule):
 
     @property
     def scene(self) -> Scene:
-        """The scene; it is read when it is first asked for.
+        """The scene; read on first access.
 
         Raises:
             SceneError: If it cannot be used.
@@ -156,7 +156,7 @@ class SceneDataModule(LightningDataModule):
     def setup(self, stage: str) -> None:
         """Read the splits that a stage needs: ``fit``, ``validate``, ``test`` or ``predict``."""
         if stage == "fit" and self.trainer is not None:
-            # If this data has trained another module before, the next one starts over.
+            # After training another module, the next one begins with its own count.
             self.first = getattr(self.trainer.lightning_module, "batches", self.first)
         scores = self.trainer is None or self.trainer.limit_val_batches
         if stage in ("fit", "validate") and scores:
@@ -171,19 +171,19 @@ class SceneDataModule(LightningDataModule):
 
     @property
     def test_split(self) -> str:
-        """The split that a trained field is scored on."""
+        """The split on which a trained field is scored."""
         return self.settings.eval_split or ("test" if "test" in self.scene.splits else "val")
 
     @property
     def validation_split(self) -> str | None:
-        """The split that is scored during training; None where there are no views for it.
+        """The split that is scored during training; None if there are no views for it.
 
-        Never ``test``, unless the settings choose it.
+        It is ``test`` only if the settings choose it.
         """
         return self.settings.eval_split or ("val" if "val" in self.scene.splits else None)
 
     def read_split(self, name: str) -> Views:
-        """The views of a split, read now if the settings did not ask for it.
+        """The views of a split, read now if they have not been read.
 
         Raises:
             SceneError: If there is none, or it cannot be used.
@@ -196,7 +196,7 @@ class SceneDataModule(LightningDataModule):
         return self.scene.splits[name]
 
     def _hold_out(self) -> None:
-        """Make a validation split of training views, if there are enough of them."""
+        """Hold out training views as a validation split, if there are enough of them."""
         train = self.scene.splits["train"]
         if not may_hold_out(train):
             return
@@ -213,7 +213,7 @@ class SceneDataModule(LightningDataModule):
         shared = set(parts["val"].files)
         video, cut = (_without(views, shared) for views in (self.scene.video, self.scene.cut))
         self._scene = replace(self.scene, splits=self.scene.splits | parts, video=video, cut=cut)
-        self._batches = {}  # Those before held all of them.
+        self._batches = {}  # Earlier batches included the held-out views.
         self.held_out = len(parts["val"])
 
     def batches(self, rank: int) -> Batches:
@@ -244,7 +244,7 @@ class SceneDataModule(LightningDataModule):
     def val_dataloader(self) -> DataLoader:
         split, tag = self.validation_split, "val"
         if split is None:
-            # These scores must not choose a checkpoint, so they get a name that nothing monitors.
+            # Test scores must not select a checkpoint, so they get a name that is not monitored.
             split, tag = self.test_split, "test"
         return self._views(split, tag, spread_order(len(self.read_split(split))))
 
@@ -258,7 +258,7 @@ class SceneDataModule(LightningDataModule):
         views = self.read_split(split)
         order, sampler = range(len(views)) if order is None else order, None
         if self.trainer is not None and self.trainer.world_size > 1 and tag != "predict":
-            # Processes score views of their own. None may be without, or the others wait for it.
+            # Each process scores its own views, at least one, or the others would wait forever.
             order = order[self.trainer.global_rank :: self.trainer.world_size] or order[:1]
             sampler = _Divided(len(order))
         dataset = _WholeViews(views, self.scene.background, tag, order)
@@ -273,13 +273,13 @@ class SceneDataModule(LightningDataModule):
 
 
 class _Endless(IterableDataset):
-    """Batches from where training is, for ever; its length is that of an epoch."""
+    """Endless batches from the current position; the length is that of an epoch."""
 
     def __init__(self, batches: Batches, data: SceneDataModule) -> None:
         self.batches, self.data = batches, data
 
     def __len__(self) -> int:
-        # With a length, Lightning draws no batch ahead: how many rays fit is known after each step.
+        # With a length Lightning does not prefetch: the number of rays is set after each step.
         return max(1, self.batches.views.pixels // self.batches.rays)
 
     def __iter__(self) -> Iterator[Batch]:
@@ -290,7 +290,7 @@ class _Endless(IterableDataset):
 
 
 class _WholeViews(Dataset):
-    """Views as `whole_view` gives them."""
+    """Dataset of whole views, see `whole_view`."""
 
     def __init__(self, views: Views, background: Tensor, tag: str, order: Sequence[int]) -> None:
         self.views, self.background, self.tag, self.order = views, background, tag, order
@@ -304,7 +304,7 @@ class _WholeViews(Dataset):
 
 
 class _Divided(DistributedSampler):
-    """All items of a process in order; Lightning divides them no further, as it does by default."""
+    """All items of a process in order; prevents Lightning from dividing them among processes."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -317,18 +317,18 @@ class _Divided(DistributedSampler):
 
 
 def whole_view(views: Views, index: int, background: Tensor) -> dict[str, Any]:
-    """A view whole.
+    """A whole view.
 
     Args:
-        views: Some views.
-        index: Which of them.
+        views: The views.
+        index: Index of the view.
         background: Colour behind the scene. [3]
 
     Returns:
-        Its ``camera``, ``time`` from 0 to 1 [], ``target`` colours before ``background`` [H, W, 3],
-        ``alpha`` uint8 [H, W], ``background`` [3], ``index`` and ``file``; where known ``shown``,
-        pixels that are scored, bool [H, W], and ``foreground``, the share of each
-        pixel that shows the foreground object, uint8 [H, W].
+        Its ``camera``, ``time`` from 0 to 1 [], ``target`` colours on ``background`` [H, W, 3],
+        ``alpha`` uint8 [H, W], ``background`` [3], ``index`` and ``file``; if known also
+        ``shown``, the pixels that are scored, bool [H, W], and ``foreground``, each
+        pixel's coverage by the foreground object, uint8 [H, W].
     """
     item = {
         "camera": views.camera(index),
@@ -344,7 +344,7 @@ def whole_view(views: Views, index: int, background: Tensor) -> dict[str, Any]:
 
 
 def spread_order(count: int) -> list[int]:
-    """An order in which the first places, however many, are spread evenly over all.
+    """An order of which any number of first elements is evenly spread over the range.
 
     Bit-reversed counting (van der Corput): 0, the middle, the quarters, ...
     """
@@ -355,7 +355,7 @@ def spread_order(count: int) -> list[int]:
 
 @dataclass(frozen=True, kw_only=True)
 class _GivenScene(SceneSettings):
-    """Settings for a scene that was read already."""
+    """Settings for a scene that is already loaded."""
 
     @classmethod
     def around(cls, scene: Scene) -> "_GivenScene":
@@ -380,7 +380,7 @@ class _GivenScene(SceneSettings):
 
 
 def _without(views: Views | None, files: set[str]) -> Views | None:
-    """Views but for those of some files; None if none are left."""
+    """Views except those of some files; None if none are left."""
     if views is None or files.isdisjoint(views.files):
         return views
     kept = [index for index, file in enumerate(views.files) if file not in files]
@@ -388,7 +388,7 @@ def _without(views: Views | None, files: set[str]) -> Views | None:
 
 
 def found_root(run: Path, root: str) -> str:
-    """Where a run's scenes are: a relative folder may be relative to where training was started."""
+    """Folder of a run's scenes; a relative one may refer to the folder where training started."""
     try:
         started = read_json(run / "run.json").get("directory")
     except (OSError, ValueError):

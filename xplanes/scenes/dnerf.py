@@ -31,17 +31,17 @@ class BlenderSettings(SceneSettings):
 
 
 def read_scene(settings: SceneSettings, splits: Sequence[str]) -> Scene:
-    """Read a scene and check all of it, so that nothing fails after training has begun.
+    """Read and check a whole scene, so that nothing fails after training has begun.
 
     Args:
-        settings: Its folder, with transforms_train.json and the images, and what to read of it.
+        settings: Settings with its folder, which contains transforms_train.json and the images.
         splits: Names of the splits to read, such as train, val, test.
 
     Returns:
-        The scene, with ``video`` where transforms_video.json exists.
+        The scene, with ``video`` if transforms_video.json exists.
 
     Raises:
-        SceneError: Anything is missing, damaged or inconsistent; the message says what to do.
+        SceneError: If anything is missing, damaged or inconsistent; the message says what to do.
     """
     folder = settings.folder
     if not any(folder.glob("transforms_*.json")):
@@ -58,7 +58,7 @@ def read_scene(settings: SceneSettings, splits: Sequence[str]) -> Scene:
 
 
 def _listed(split: str, path: Path) -> Listing:
-    """The frames of a split; warns why a split that is only scored has none."""
+    """The frames of a split; if one that is only scored has none, warns and leaves it out."""
     try:
         return read_transforms(path)
     except MissingSplitError as problem:

@@ -1,4 +1,4 @@
-"""Names, poses, numbers and times in files of cameras, read and checked."""
+"""Reading and checking of names, poses, numbers and times in camera files."""
 
 import codecs
 import json
@@ -38,13 +38,13 @@ SUFFIXES = ("", *ENDINGS)
 RIGID_TOLERANCE = 1e-3
 
 FARTHEST = 1e15
-"""Largest coordinate of a camera; squares of it still fit single precision."""
+"""Largest coordinate of a camera; its square still fits single precision."""
 
 STILL = 1e-4
-"""World units by which the positions of a fixed camera differ at most."""
+"""Largest difference, in world units, between positions of a fixed camera."""
 
 FAR_OFF = 60
-"""Degrees between the cameras' mean up vector and the z axis that is not up then."""
+"""Angle in degrees between the cameras' mean up vector and the z axis, above which z is not up."""
 
 ROUNDING = 1e-4
 """Largest rounding error of camera positions in single precision, as a share of their extent."""
@@ -53,19 +53,19 @@ ROUNDING = 1e-4
 def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> Path:
     """The file that ``name`` refers to inside ``folder``.
 
-    Suffixes may be left out or be those of another format, and names differ in case or in how
-    accents are written, as long as one file alone fits. Of a path that leads nowhere, such as one
-    of another machine, the first folders are left out; a name without folders may be in images.
+    The suffix may be missing or that of another format, and the name may differ in case or in the
+    encoding of accents, as long as only one file matches. If a path does not exist, such as one of
+    another machine, its first folders are dropped; a name without folders may be in images.
 
     Args:
         label: The file and frame that name it, for messages.
         folder: The scene's folder.
         name: Name relative to ``folder``, or an absolute path into it.
-        key: The key that holds the name.
+        key: The key of the name.
 
     Raises:
-        BrokenFrameError: If there is no such file, or nothing in it.
-        SceneError: If it is no name, or leaves the folder.
+        BrokenFrameError: If there is no such file, or it is empty.
+        SceneError: If it is not a name, or leaves the folder.
     """
     choices = list(paths_inside(label, folder, name, key, "./train/r_000"))
     choices += [folder / "images" / path.name for path in choices if path.parent == folder]
@@ -100,16 +100,16 @@ def _with_content(label: str, image: Path) -> Path:
 def usable(
     what: str, read: Callable[[Item], Found], items: Sequence[Item]
 ) -> list[tuple[int, Found]]:
-    """What a function makes of frames, with their places; a warning lists those left out.
+    """Results of a function for usable frames, with their indices; warns about the others.
 
     Args:
-        what: What the frames are called, for the warning.
-        read: Raises `BrokenFrameError` for a frame that is to be left out.
+        what: Name of the frames, for the warning.
+        read: The function; raises `BrokenFrameError` for a frame that is to be left out.
         items: The frames.
 
     Raises:
-        MissingSplitError: If all are left out.
-        SceneError: If ``read`` raises others; it names all of them.
+        MissingSplitError: If all frames are left out.
+        SceneError: If ``read`` raises other errors; the message has all of them.
     """
     found: list[tuple[int, Found]] = []
     left_out, wrong = [], []
@@ -129,7 +129,7 @@ def usable(
 
 
 def _stems(folder: Path) -> dict[str, list[Path]]:
-    """Images of a folder by their names without suffix, in lower case."""
+    """Images of a folder by name without suffix, in lower case."""
     return _stems_at(folder, folder.stat().st_mtime_ns)
 
 
@@ -137,7 +137,7 @@ def _stems(folder: Path) -> dict[str, list[Path]]:
 def _stems_at(folder: Path, changed: int) -> dict[str, list[Path]]:
     found: dict[str, list[Path]] = {}
     inside = sorted(folder.iterdir())
-    if len(inside) == 1 and inside[0].is_dir():  # Unpacked one folder too deep.
+    if len(inside) == 1 and inside[0].is_dir():  # The archive was unpacked one level too deep.
         inside = sorted(inside[0].iterdir())
     for path in filter(is_image, inside):
         found.setdefault(_plain(path.stem), []).append(path)
@@ -145,12 +145,12 @@ def _stems_at(folder: Path, changed: int) -> dict[str, list[Path]]:
 
 
 def _plain(name: str) -> str:
-    """A name without case; macOS writes accents as letters of their own."""
+    """A name in lower case and normalised; macOS stores accents as separate characters."""
     return unicodedata.normalize("NFC", name).casefold()
 
 
 def _like(folder: Path) -> Path | None:
-    """A folder, or the only one beside it whose name differs in case or accents alone."""
+    """A folder, or the only one beside it whose name differs only in case or accents."""
     if folder.is_dir() or folder.parent == folder:
         return folder
     if (parent := _like(folder.parent)) is None:
@@ -160,19 +160,19 @@ def _like(folder: Path) -> Path | None:
 
 
 def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) -> Iterator[Path]:
-    """Paths that a name may refer to inside ``folder``, as it is and with suffixes of images.
+    """Paths that a name may refer to inside ``folder``, unchanged and with image suffixes.
 
-    Links are followed, wherever they lead; ``..`` does not leave the folder.
+    Links are followed, even out of the folder; ``..`` must not leave it.
 
     Args:
         label: The file and frame that name it, for messages.
         folder: The scene's folder.
         name: Name relative to ``folder``, or an absolute path.
-        key: The key that holds the name.
+        key: The key of the name.
         example: Such a name, for messages.
 
     Raises:
-        SceneError: If it is no name, or leaves the folder.
+        SceneError: If it is not a name, or leaves the folder.
     """
     if not isinstance(name, str) or not name or "\0" in name:
         raise SceneError(f"{label}: {key} is {short(name)}; it must be text such as {example}.")
@@ -188,7 +188,7 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
             f"{label}: {key} leaves the scene's folder {folder} (it is {name}). Put its files "
             f"inside the folder and correct {key}."
         )
-    # Of a path that leads nowhere, folders are left out from the front.
+    # If the path does not exist, its first folders are dropped one by one.
     for first in range(max(1, len(parts))):
         relative = Path(*parts[first:])
         if relative.is_absolute() or (first and not (folder / relative).parent.is_dir()):
@@ -200,11 +200,11 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
 def mask_files(
     folder: Path, names: Sequence[Sequence[str]], key: str = "data.masks"
 ) -> tuple[Path | None, ...]:
-    """The mask of each image; None, with a warning, for images without.
+    """The mask of each image; None, with a warning, for images without a mask.
 
     Args:
         folder: Folder of masks.
-        names: Names that the mask of each image may have in it, in the order of preference. [V]
+        names: Possible names of each image's mask, in order of preference. [V]
         key: The setting that names the folder.
 
     Raises:
@@ -228,8 +228,8 @@ def mask_files(
 
 
 def unit_times(times: Sequence[float]) -> list[float]:
-    """Times in any unit, mapped to [0, 1]; all 0 where they are equal."""
-    # Integers stay as they are until the first was subtracted: clocks count nanoseconds.
+    """Times in any unit, mapped to [0, 1]; all 0 if they are equal."""
+    # Subtracted before conversion to float, which cannot represent clocks in nanoseconds exactly.
     first, last = min(times), max(times)
     return [(time - first) / (last - first) if last > first else 0.0 for time in times]
 
@@ -239,10 +239,10 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
 
     Args:
         path: The file.
-        content: What the object must have, for messages.
+        content: Required content, for messages.
 
     Raises:
-        SceneError: If it cannot be read, or is none.
+        SceneError: If it cannot be read, or is not an object.
     """
     require_fetched(path)
     try:
@@ -257,7 +257,7 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
 
 
 def _parsed(text: str) -> Any:
-    """A JSON text, which may have comments and commas before closing brackets."""
+    """Parse JSON that may have comments and trailing commas."""
     try:
         return json.loads(text)
     except json.JSONDecodeError:
@@ -271,7 +271,7 @@ def _parsed(text: str) -> Any:
 def decoded(content: bytes) -> str:
     """Text in UTF-8, or in UTF-16 or UTF-32 if a byte order mark indicates it.
 
-    Some editors begin files with a mark; PowerShell writes UTF-16.
+    Some editors write a byte order mark; PowerShell writes UTF-16.
     """
     for mark, encoding in (
         (codecs.BOM_UTF32_LE, "utf-32"),
@@ -288,7 +288,7 @@ def require_fetched(path: Path) -> None:
     """Refuse a placeholder of a file that was not fetched, such as a pointer of Git LFS.
 
     Raises:
-        SceneError: Saying what it is and how to fetch the file.
+        SceneError: With the kind of placeholder, and how to fetch the file.
     """
     if (other := stand_in(path)) is not None:
         raise SceneError(f"{path} {other}.")
@@ -298,16 +298,16 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
     """A camera-to-world matrix: finite, rigid, right-handed.
 
     Args:
-        label: The file and frame that hold it, for messages.
-        matrix: 4 rows of 4 numbers; the last may be missing.
-        key: What it is called there.
+        label: Its file and frame, for messages.
+        matrix: 4 rows of 4 numbers; the last row may be missing.
+        key: Its key there.
 
     Returns:
         The matrix. float64 [4, 4]
 
     Raises:
-        BrokenFrameError: If it is not finite, or there is none.
-        SceneError: If it is no such matrix.
+        BrokenFrameError: If it is not finite, or missing.
+        SceneError: If it is not such a matrix.
     """
     if matrix is None:
         raise BrokenFrameError(f"{label} has no {key}: the camera is unknown.")
@@ -329,7 +329,7 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
             f"Poses are camera-to-world, written row by row (perhaps this one is transposed)."
         )
     rotation = pose[:3, :3]
-    # A camera's own scale turns no ray.
+    # A uniform scale of the camera does not change its rays.
     scale = np.cbrt(abs(np.linalg.det(rotation)))
     if scale > 0 and abs(scale - 1) > RIGID_TOLERANCE:
         rotation /= scale
@@ -349,7 +349,7 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
 
 
 STRING = r'("(?:[^"\\]|\\.)*")'
-"""A text in JSON."""
+"""A string in JSON."""
 
 UP = {3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 """The up vector in the stored pixels (right, up) by EXIF orientation; (0, 1) for others."""
@@ -358,24 +358,24 @@ UP = {3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 def world_turn(
     poses: Tensor, paths: Sequence[Path], orient: bool | None
 ) -> tuple[Tensor | None, str]:
-    """How a world is turned for the cameras' mean up vector to be its z axis, and what is up then.
+    """Rotation of the world that makes the cameras' mean up vector its z axis, and a description.
 
     Up in an image follows its EXIF orientation; pixels and cameras stay as they are.
 
     Args:
         poses: Cameras with OpenGL's axes. [V, 4, 4]
-        paths: Their images; none where these are frames of videos. [V]
-        orient: Whether to turn the world. None turns it if the mean up vector is more than
+        paths: Their images; empty for frames of videos. [V]
+        orient: Whether to rotate the world. None rotates it if the mean up vector is more than
             `FAR_OFF` degrees from the z axis.
 
     Returns:
-        The rotation, float64 [3, 3], or None where the world stays as it is; and a sentence.
+        The rotation, float64 [3, 3], or None if the world is unchanged; and a description.
     """
     tags = [orientation(path) for path in paths] or [1] * len(poses)
     if turned_photos := sum(tag in UP for tag in tags):
         logger.info(
-            "%d of %d images are to be shown turned, as their EXIF orientation says: pixels are "
-            "read as they are stored, and up vectors follow EXIF",
+            "%d of %d images have an EXIF orientation that rotates them: pixels are read as they "
+            "are stored, and up vectors follow EXIF",
             *(turned_photos, len(paths)),
         )
     aside = torch.tensor([UP.get(tag, (0, 1)) for tag in tags], dtype=torch.float64)
@@ -383,8 +383,8 @@ def world_turn(
     if (rotation := upright(up)) is None:
         if orient:
             warn(
-                "The up vectors of the cameras cancel out, so the world keeps the axes that the "
-                "files give it. data.orient=false says that it should."
+                "The up vectors of the cameras cancel out, so the world keeps the axes of the "
+                "files. data.orient=false confirms this."
             )
         return None, "the z axis of the files; the cameras' up vectors cancel out"
     off = math.degrees(math.acos(min(1.0, max(-1.0, float(rotation[2, 2])))))
@@ -398,23 +398,23 @@ def world_turn(
 
 
 def require_precision(source: Path, positions: np.ndarray) -> None:
-    """Refuse cameras so far from the world's origin that single precision moves them.
+    """Refuse cameras so far from the world's origin that single precision changes their poses.
 
     Args:
-        source: Where they were read, for messages.
-        positions: Of all cameras of a capture. float64 [V, 3]
+        source: File of the cameras, for messages.
+        positions: Positions of all cameras of a capture. float64 [V, 3]
 
     Raises:
-        SceneError: If they lie too far away.
+        SceneError: If they are too far away.
     """
     extent = float(np.ptp(positions, axis=0).max())
     largest = float(np.abs(positions).max())
-    still = extent <= STILL
-    room = FARTHEST if still else ROUNDING * extent / float(np.finfo(np.float32).eps)
+    fixed = extent <= STILL
+    room = FARTHEST if fixed else ROUNDING * extent / float(np.finfo(np.float32).eps)
     if not largest <= min(room, FARTHEST):
         raise SceneError(
             f"{source}: the cameras lie up to {largest:.3g} world units from the origin and "
-            f"{extent:.3g} apart, which single precision cannot hold. Move the capture to the "
+            f"{extent:.3g} apart, which single precision cannot resolve. Move the capture to the "
             "origin first, as with colmap model_transformer, or correct the cameras."
         )
 
@@ -431,15 +431,15 @@ def refuse_repeats(
         times: Their times; empty for a static scene, whose cameras may repeat. [V]
 
     Raises:
-        SceneError: If a file, or a camera and time, comes twice.
+        SceneError: If a file, or a pair of camera and time, occurs twice.
     """
     files: dict[Path, str] = {}
     seen: dict[tuple[bytes, float], str] = {}
     for index, label in enumerate(labels):
         other = files.setdefault(paths[index], label)
         if other is not label:
-            raise SceneError(f"{label} shows the same file as {other}. Remove one of the two.")
-        # Paths around a static object may pass the same place twice, so only times convict.
+            raise SceneError(f"{label} has the same file as {other}. Remove one of the two.")
+        # In a static scene a camera may pass the same place twice; repeats are refused with times.
         if not times:
             continue
         other = seen.setdefault((poses[index].tobytes(), times[index]), label)
@@ -457,12 +457,12 @@ def is_number(value: Any) -> TypeGuard[float]:
     try:
         return math.isfinite(value)
     except OverflowError:
-        # JSON holds integers that no float can.
+        # JSON may contain integers too large for a float.
         return False
 
 
 def number_in(text: str) -> float | None:
-    """A finite number that a text holds, whole where it is written so; None for other texts."""
+    """The finite number in a string, an int if it is written as one; None for other strings."""
     for kind in (int, float):
         with suppress(ValueError):
             number = kind(text)

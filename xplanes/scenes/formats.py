@@ -1,4 +1,4 @@
-"""Image files: the formats that are read, and error messages for the others."""
+"""Image files: supported formats, and error messages for others."""
 
 import re
 import struct
@@ -13,14 +13,14 @@ from xplanes.errors import SceneError
 from xplanes.files import stand_in
 
 FORMATS = """PNG JPEG MPO WEBP TIFF BMP AVIF JPEG2000 PPM TGA GIF QOI""".split()
-"""Formats of Pillow that are read; it runs other programs for some of the others."""
+"""Pillow's formats that are read; for some others it would run external programs."""
 
 ENDINGS = """.png .jpg .jpeg .jpe .jfif .webp .tif .tiff .bmp .avif .jp2 .ppm .pgm .tga .gif
 .qoi""".split()
 """Endings of their files."""
 
 RAW = ".dng .nef .cr2 .cr3 .arw .raf .orf .rw2 .pef .srw".split()
-"""Endings of cameras' raw files, in which Pillow would find a thumbnail."""
+"""Endings of cameras' raw files, from which Pillow would read only a thumbnail."""
 
 OTHERS = [*RAW, *".heic .heif .jxl .exr .hdr .psd".split()]
 """Endings of image files that are recognised but not read."""
@@ -37,10 +37,10 @@ KINDS = {
     r"\x93NUMPY": "NumPy's format",
     r"%PDF": "PDF",
 }
-"""How files of other formats begin."""
+"""First bytes of files in other formats."""
 
 ORIENTATION = 0x0112
-"""EXIF's tag of how an image is to be turned when it is shown."""
+"""EXIF tag of an image's orientation."""
 
 SIXTEEN_BIT_MODES = ("I;16", "I;16L", "I;16B", "I")
 UNTURN = {
@@ -49,14 +49,14 @@ UNTURN = {
     7: "-transverse",
     8: "-rotate 90",
 }
-"""How ImageMagick undoes an EXIF orientation."""
+"""ImageMagick options that undo an EXIF orientation."""
 
 TURNED_BACK = {
     **{2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180},
     **{4: Image.Transpose.FLIP_TOP_BOTTOM, 5: Image.Transpose.TRANSPOSE},
     **{6: Image.Transpose.ROTATE_90, 7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_270},
 }
-"""How Pillow undoes an EXIF orientation."""
+"""Pillow operations that undo an EXIF orientation."""
 
 UNREADABLE = (
     OSError,
@@ -69,7 +69,7 @@ UNREADABLE = (
 
 
 def is_image(path: Path) -> bool:
-    """Whether a file's name is that of an image, be it of a format that is read or not."""
+    """Whether a file's name is that of an image, in a supported format or not."""
     return path.suffix.lower() in (*ENDINGS, *OTHERS) and not path.name.startswith(".")
 
 
@@ -87,7 +87,7 @@ def orientation(path: Path) -> int:
     """EXIF orientation of an image, from 1 (upright) to 8; pixels are read as they are stored."""
     try:
         with _opened(path) as picture:
-            # Without one, Pillow would decode a whole PNG to search for it.
+            # Checked first, because Pillow would decode a whole PNG to search for the tag.
             if picture.format != "TIFF" and not {"exif", "Raw profile type exif"} & {*picture.info}:
                 return 1
             found = picture.getexif().get(ORIENTATION, 1)
@@ -97,48 +97,48 @@ def orientation(path: Path) -> int:
 
 
 def mask_misfit(mask: Path, size: tuple[int, ...], image: Path, wanted: tuple[int, ...]) -> str:
-    """What to do about a mask that has another height and width than its image."""
+    """Error message for a mask whose size differs from that of its image."""
     text = (
         f"{mask} has {size[1]}x{size[0]} pixels, but {image}, whose mask it is, has "
         f"{wanted[1]}x{wanted[0]}."
     )
     if size == wanted[::-1] and (turn := UNTURN.get(orientation(image))):
         return (
-            f"{text} The image's EXIF orientation says that it is shown turned, and the mask was "
-            "made of the turned image. Images are read as they are stored: turn the masks back "
+            f"{text} The image's EXIF orientation rotates it for display, and the mask was made "
+            "from the rotated image. Images are read as they are stored: rotate the masks back "
             f"(magick mogrify {turn} {mask.parent}/*)."
         )
     if size == wanted[::-1]:
         return (
-            f"{text} Its sides are swapped: it was perhaps made of an image that was shown turned, "
-            "as an EXIF orientation says. Make it of the image's pixels as they are stored."
+            f"{text} Its sides are swapped: perhaps it was made from an image that was rotated by "
+            "its EXIF orientation. Make it from the image's pixels as they are stored."
         )
     return f"{text} Export the mask at the size of the image."
 
 
 @cache
 def _formats() -> tuple[str, ...]:
-    """Those of `FORMATS` that this Pillow knows."""
+    """The entries of `FORMATS` that the installed Pillow supports."""
     Image.init()
     return tuple(name for name in FORMATS if name in Image.OPEN)
 
 
 def _opened(path: Path) -> Image.Image:
     if path.suffix.lower() in RAW:
-        raise OSError("it holds what the sensor measured")
+        raise OSError("it holds raw sensor data")
     return Image.open(path, formats=_formats())
 
 
 def open_image(path: Path) -> Image.Image:
-    """An image file with its pixels as they are stored; in general, only its header is read.
+    """Open an image with its pixels as they are stored; usually only the header is read.
 
     Raises:
-        OSError: If it is none, and others of `UNREADABLE`.
+        OSError: If it is not an image; also others of `UNREADABLE`.
     """
     picture = _opened(path)
     if not isinstance(picture, TiffImageFile):
         return picture
-    # Pillow applies the EXIF orientation of TIFF files alone.
+    # Pillow applies the EXIF orientation only to TIFF files.
     if (turn := TURNED_BACK.get(picture.tag_v2.get(ORIENTATION, 1))) is None:
         return picture
     with picture:

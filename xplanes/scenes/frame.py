@@ -1,4 +1,4 @@
-"""The field's frame: the cube [-1, 1]^3 and how the world maps into it."""
+"""The field's frame: the map from the world into the cube [-1, 1]^3."""
 
 import math
 from dataclasses import dataclass, replace
@@ -12,22 +12,22 @@ from xplanes.scenes.cameras import cast_rays, project, turned
 from xplanes.scenes.views import Views
 
 MARGIN = 1.03
-"""Margin around the farthest content that any view shows."""
+"""Margin around the farthest visible content."""
 
 MIDDLE = 0.6
 """Share of an image's width and height that counts as its middle."""
 
 OUTLIERS = 0.02
-"""Share of points that a cube may leave out on either side of an axis."""
+"""Share of points that the cube may leave out at either end of an axis."""
 
 ROOM = 1.15
-"""Margin around points, which lie on surfaces and are sparse on moving content."""
+"""Margin around points: they are sparse, in particular on moving content."""
 
 LEAST_POINTS, MOST_POINTS, MOST_CAMERAS = 32, 20_000, 64
-"""Points in the middle that a cube needs; points and cameras that are sampled."""
+"""Least number of points in the images' middle for a cube; sampled points and cameras."""
 
 CONVERGENCE = 0.02
-"""Least eigenvalue at which optical axes are not nearly parallel, so that they meet."""
+"""Least eigenvalue for which optical axes meet in a point, rather than being nearly parallel."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class Frame:
 
     Attributes:
         scale: Field units per world unit.
-        rotation: Turns world axes into the field's. [3, 3]
-        centre: World point that becomes the origin. [3]
-        source: What the cube was estimated from; empty if unknown.
+        rotation: Rotation from the world's axes to the field's. [3, 3]
+        centre: World point that is mapped to the origin. [3]
+        source: Source of the cube's estimate; empty if unknown.
     """
 
     scale: float
@@ -47,7 +47,7 @@ class Frame:
     source: str = ""
 
     def to(self, device: torch.device) -> "Frame":
-        """The same on another device."""
+        """The frame on another device."""
         return replace(self, rotation=self.rotation.to(device), centre=self.centre.to(device))
 
     def points(self, world: Tensor) -> Tensor:
@@ -69,10 +69,10 @@ def frame_content(frame: Frame) -> dict[str, Any]:
 
 
 def read_frame(content: Any, name: str) -> Frame:
-    """A frame from what `frame_content` gives, tensors or lists.
+    """A frame from the result of `frame_content`, with tensors or lists.
 
     Raises:
-        SceneError: If it is no frame; the message calls its origin ``name``.
+        SceneError: If it is not a frame; ``name`` is its source in the message.
     """
     try:
         scale = float(content["scale"])
@@ -89,10 +89,10 @@ def read_frame(content: Any, name: str) -> Frame:
 
 
 def check_frame(frame: Frame, name: str) -> None:
-    """Refuse what is no similarity.
+    """Refuse a frame that is not a similarity.
 
     Raises:
-        SceneError: For wrong shapes or numbers; the message calls its origin ``name``.
+        SceneError: For wrong shapes or numbers; ``name`` is its source in the message.
     """
     if frame.rotation.shape != (3, 3) or frame.centre.shape != (3,):
         raise SceneError(
@@ -105,20 +105,20 @@ def check_frame(frame: Frame, name: str) -> None:
         raise SceneError(f"{name}: frame.centre={frame.centre.tolist()}: must be finite")
     rotation = frame.rotation.double()
     gap = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
-    # NaN compares as false.
+    # The negated comparison also refuses NaN.
     if not gap < 1e-3 or torch.linalg.det(rotation) < 0:
         raise SceneError(f"{name}: frame.rotation is no rotation (orthonormal, determinant 1)")
 
 
 def cube_frame(half_side: float, centre: Tensor, source: str = "") -> Frame:
-    """The frame in which a world-aligned cube becomes [-1, 1]^3."""
+    """The frame that maps a world-aligned cube to [-1, 1]^3."""
     return Frame(1 / half_side, torch.eye(3), centre, source)
 
 
 def backwards(views: Views) -> Tensor:
-    """Unit vectors opposite to the viewing direction of each image's middle. [V, 3]
+    """Unit vectors opposite to the viewing direction at each image's centre. [V, 3]
 
-    They are the cameras' z axes if principal points are centred.
+    These are the cameras' z axes if principal points are centred.
     """
     intrinsics = views.intrinsics
     rows, columns = (0.5 * intrinsics.size.double() - 0.5).unbind(dim=1)
@@ -134,19 +134,19 @@ def backwards(views: Views) -> Tensor:
 
 
 def optical_centre(views: Views) -> Tensor:
-    """The point nearest to all rays through images' middles, in the least-squares sense. [3]
+    """The point nearest to the central rays of all images, in the least-squares sense. [3]
 
-    Parallel cameras leave the depth undetermined: it is then that of the world's origin.
+    For parallel cameras the depth is undetermined, and is that of the world's origin.
     """
     origin, projector = views.camera_to_world[:, :3, 3].double(), _projectors(views)
     target = (projector @ origin[..., None])[..., 0].mean(dim=0)
-    # Of all points that solve it equally well, the pseudo-inverse takes the one nearest the origin.
+    # The pseudo-inverse selects the solution nearest to the origin.
     inverse = torch.linalg.pinv(projector.mean(dim=0), atol=1e-4, hermitian=True)
     return (inverse @ target).float()
 
 
 def axes_meet(views: Views) -> bool:
-    """Whether the rays through images' middles meet in a point; those nearly parallel do not."""
+    """Whether the central rays of the images meet in a point, rather than being nearly parallel."""
     return float(torch.linalg.eigvalsh(_projectors(views).mean(dim=0))[0]) >= CONVERGENCE
 
 
@@ -161,15 +161,15 @@ def scene_frame(
 ) -> Frame:
     """The frame of a scene: the smallest cube that its cameras and silhouettes allow.
 
-    The cameras' common view gives a first cube around the point that they look at. No ray through
-    the foreground passes the centre farther away than the scene reaches, and over views from many
-    sides the farthest comes close to it: that distance, with a margin, shrinks the cube. Views from
-    one side alone tell little about depth and shrink it less. Opaque images have no silhouettes:
-    there the cube is that of the points in the middle of most images, if enough are known.
+    The cameras' common field of view gives a first cube around the point at which they look. The
+    distance of the farthest foreground ray from the centre is a lower bound of the scene's radius,
+    and close to it for views from many sides: with a margin, it shrinks the cube. Views from one
+    side constrain the depth less, and shrink it less. Opaque images have no silhouettes: the cube
+    then encloses the points in the middle of most images, if enough are known.
 
     Args:
         views: Training views.
-        half_side: Half the side of the cube in world units; None estimates it.
+        half_side: Half the side of the cube in world units; estimated when None.
         points: World points on surfaces, if known. [N, 3]
 
     Raises:
@@ -202,7 +202,7 @@ def scene_frame(
 
 
 def pixels_across(views: Views, frame: Frame) -> float:
-    """Image pixels that a side of the cube covers at its centre; the median view.
+    """Image pixels that a side of the cube covers at its centre, in the median view.
 
     Args:
         views: Training views.
@@ -214,7 +214,7 @@ def pixels_across(views: Views, frame: Frame) -> float:
 
 
 def pixels_of_detail(views: Views, frame: Frame, surrounded: bool) -> float:
-    """`pixels_across` where planes follow it; 0 for a scene with surroundings in which things move.
+    """`pixels_across`; 0 for moving scenes with surroundings, whose planes do not depend on it.
 
     Args:
         views: Training views.
@@ -225,15 +225,15 @@ def pixels_of_detail(views: Views, frame: Frame, surrounded: bool) -> float:
 
 
 def _middle_box(views: Views, points: Tensor, centre: Tensor) -> Tensor | None:
-    """The box of the points that most cameras see in the middle of their images, with some room.
+    """The box, with a margin, of points that most cameras see in the middle of their images.
 
     Args:
         views: Training views.
         points: World points. [N, 3]
-        centre: What the cameras look at, which the box must hold if they look at a point. [3]
+        centre: Point at which the cameras look; the box must contain it if their axes meet. [3]
 
     Returns:
-        Least and largest corner; None where there is no such box. [2, 3]
+        Lower and upper corner; None if there is no such box. [2, 3]
     """
     points = points[points.isfinite().all(dim=1)]
     points = points[:: -(-len(points) // MOST_POINTS) or 1]
@@ -262,10 +262,10 @@ def _middle_box(views: Views, points: Tensor, centre: Tensor) -> Tensor | None:
 
 
 def _spread(views: Views) -> float:
-    """Share of a distance from the centre that some view shows, in the worst direction.
+    """Visible share of a distance from the centre, in the best view for the worst direction.
 
-    Views from all sides show nearly all of it; views from one side see what lies along their axes
-    foreshortened, those of one axis not at all.
+    It is nearly 1 for views from all sides, small for views from one side, which foreshorten depth,
+    and 0 for views along a single axis.
     """
     axis = backwards(views).double()
     common = torch.linalg.eigh(axis.T @ axis).eigenvectors.T
@@ -275,10 +275,10 @@ def _spread(views: Views) -> float:
 
 
 def _reach(views: Views, centre: Tensor) -> float:
-    """Largest distance from ``centre`` at which a ray through the foreground passes it.
+    """Largest distance between ``centre`` and a ray through the foreground.
 
-    The farther a ray points away from the centre, the farther it passes, up to a right angle: the
-    farthest one leads through the outline, unless the camera looks past the centre on all sides.
+    The distance grows with the angle between the ray and the direction to the centre, up to a right
+    angle. The farthest ray thus passes through the outline of the silhouette.
     """
     largest = 0.0
     for index in range(len(views)):
@@ -287,7 +287,7 @@ def _reach(views: Views, centre: Tensor) -> float:
             offset = centre - origins
             along = (offset * directions).sum(dim=-1, keepdim=True)
             away = (offset - along * directions).norm(dim=-1)
-            # Rays on both sides of the right angle enclose one that passes at the camera.
+            # If rays lie on both sides of a right angle, the largest distance is the camera's.
             beyond = bool((along > 0).any() and (along < 0).any())
             largest = max(largest, float((offset.norm(dim=-1) if beyond else away).max()))
     return largest if largest > 0 else math.inf

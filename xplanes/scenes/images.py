@@ -1,4 +1,4 @@
-"""Image files decoded, multiplied by alpha and reduced to the working resolution."""
+"""Decodes image files, premultiplies them by alpha and reduces them to the working resolution."""
 
 import hashlib
 from collections.abc import Iterator, Sequence
@@ -23,10 +23,10 @@ from xplanes.scenes.store import Size
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "P", "PA", "1")
 
 PLAIN = MaskKind(labels=False)
-"""Masks from black to white."""
+"""Kind of plain masks, from black to white."""
 
 MASKS = 3
-"""Version of what masks mean; increase it whenever decoded images change."""
+"""Version of the treatment of masks; increase it whenever decoded images change."""
 
 
 def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
@@ -37,10 +37,10 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
         resolution: Width in pixels; None keeps the size of the files.
 
     Returns:
-        Colour, multiplied by alpha before it was averaged, and alpha. uint8 [V, H, W, 4]
+        Colour, premultiplied by alpha before it is averaged, and alpha. uint8 [V, H, W, 4]
 
     Raises:
-        SceneError: A file cannot be decoded, sizes differ, or the resolution cannot be met.
+        SceneError: If a file cannot be decoded, sizes differ, or the resolution cannot be met.
     """
     native = native_sizes(paths)
     for path, (height, width) in zip(paths, native, strict=True):
@@ -58,7 +58,7 @@ def native_sizes(paths: Sequence[Path]) -> list[Size]:
     """Heights and widths of image files, read from their headers alone.
 
     Raises:
-        SceneError: If files are no images; it names all of them.
+        SceneError: If files are not images; the message names all of them.
     """
     return all_of(lambda path: read_header(path)[0], paths)
 
@@ -74,7 +74,7 @@ def final_sizes(
         resolution: Width in pixels; None keeps the sizes.
 
     Raises:
-        SceneError: If an image is narrower.
+        SceneError: If an image is narrower than ``resolution``.
     """
     if resolution is None:
         return list(native)
@@ -82,7 +82,7 @@ def final_sizes(
         if resolution > width:
             raise SceneError(
                 f"data.resolution={resolution} is more than the {width} pixels that {path} is "
-                f"wide. Enlarged images hold no more detail: give at most {width}, or null for the "
+                f"wide. Enlarged images have no more detail: set at most {width}, or null for the "
                 "native size."
             )
     return [(max(1, round(height * resolution / width)), resolution) for height, width in native]
@@ -99,25 +99,25 @@ def read_images(
 ) -> Tensor | store.StoredImages:
     """Decode images of any sizes and reduce them.
 
-    Images that take more than `store.IN_MEMORY` bytes are decoded once to a file of the cache.
+    Images that take more than `store.IN_MEMORY` bytes are decoded once to a file in the cache.
 
     Args:
         paths: Image files, at least one. [V]
-        sizes: Height and width of each image after that. [V]
-        masks: Files that alpha is multiplied by; none where it is empty. [V]
-        has_ray: Pixels of the reduced images that show anything, of each image bool [h, w], or None
-            for all; all of all images where it is empty. [V]
-        cache: Folder of decoded images; that of the user when None.
-        kind: What masks mean, see `masks.read_mask`.
-        clear: Levels of grey, of 255, that are transparent.
+        sizes: Height and width of each reduced image. [V]
+        masks: Files by which alpha is multiplied; empty if there are none. [V]
+        has_ray: For each reduced image, the pixels with a ray, bool [h, w], or None for all pixels;
+            empty if all images have all rays. [V]
+        cache: Folder of decoded images; the user's cache when None.
+        kind: Meaning of the masks, see `masks.read_mask`.
+        clear: Grey levels, out of 255, that are transparent.
 
     Returns:
-        Colour, multiplied by alpha before it was averaged, and alpha, smaller images padded with
-        zeros at the bottom and on the right. uint8 [V, H, W, 4]
+        Colour, premultiplied by alpha before it is averaged, and alpha; smaller images are padded
+        with zeros at the bottom and on the right. uint8 [V, H, W, 4]
 
     Raises:
-        SceneError: A file cannot be decoded, or a mask does not fit its image.
-        StorageError: The cache cannot be written.
+        SceneError: If a file cannot be decoded, or a mask does not fit its image.
+        StorageError: If the cache cannot be written.
     """
     jobs = _jobs(paths, sizes, masks, has_ray, kind, clear)
     sources = [*paths, *(mask for mask in masks if mask is not None)]
@@ -131,7 +131,7 @@ def read_images(
     try:
         return store.images(sizes, jobs, sources, recipe, has_alpha, cache)
     except SceneError:
-        all_of(lambda job: sum(1 for _ in job()), jobs)  # Name all that cannot be decoded.
+        all_of(lambda job: sum(1 for _ in job()), jobs)  # Reports all files that fail.
         raise
 
 
@@ -143,7 +143,7 @@ def _jobs(
     kind: MaskKind = PLAIN,
     clear: Sequence[int] = (),
 ) -> list[store.Job]:
-    """What decodes the images, one each."""
+    """Jobs that decode the images, one for each."""
 
     def job(index: int) -> store.Job:
         def decode() -> Iterator[tuple[int, np.ndarray]]:
@@ -157,14 +157,14 @@ def _jobs(
 
 
 def cleared(pixels: np.ndarray, shown: Tensor | None) -> np.ndarray:
-    """Pixels with zeros where they show nothing. uint8 [h, w, C], bool [h, w]"""
+    """Pixels, set to 0 outside ``shown``. uint8 [h, w, C], bool [h, w]"""
     if shown is not None:
         pixels[~shown.numpy()] = 0
     return pixels
 
 
 def digests(masks: Sequence[Tensor | None]) -> list[str]:
-    """Hashes of masks, most of which are the same tensor."""
+    """Hashes of masks; repeated tensors are hashed once."""
     known: dict[int, str] = {id(None): ""}
     for mask in masks:
         if mask is not None and id(mask) not in known:
@@ -190,7 +190,7 @@ def read_image(
 def load_premultiplied(path: Path, clear: Sequence[int] = ()) -> np.ndarray:
     """Decode one image to colour times alpha and alpha, from 0 to 255. float32 [4, H, W]
 
-    Pixels of some levels of grey are transparent.
+    Pixels with one of the grey levels ``clear`` are transparent.
     """
     try:
         with open_image(path) as picture:
@@ -207,15 +207,15 @@ def load_premultiplied(path: Path, clear: Sequence[int] = ()) -> np.ndarray:
 
 
 def shrink(channels: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Reduce premultiplied channels: each pixel becomes the mean of the area that it covers.
+    """Reduce premultiplied channels: each pixel is the mean over its area.
 
-    Unlike Lanczos, whose rings put light and alpha around every edge, means stay exact zeros
-    where nothing is.
+    Lanczos would cause ringing in colour and alpha around every edge; means are exactly 0 in empty
+    areas.
 
     Args:
         channels: Colour times alpha and alpha, from 0 to 255. float32 [4, h, w]
-        width: Columns wanted, at most those given.
-        height: Rows wanted, at most those given.
+        width: Columns of the result, at most those of the input.
+        height: Rows of the result, at most those of the input.
 
     Returns:
         Rounded pixels with colour <= alpha. uint8 [H, W, 4]
@@ -234,7 +234,7 @@ def shrink(channels: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def _area_weights(fine: int, coarse: int) -> np.ndarray:
-    """Share of each fine cell in each coarse one, both dividing one length. [coarse, fine]"""
+    """Overlap of each fine cell with each coarse cell of the same length. [coarse, fine]"""
     edges = np.arange(coarse + 1) * (fine / coarse)
     cells = np.arange(fine)
     overlap = np.minimum(edges[1:, None], cells + 1) - np.maximum(edges[:-1, None], cells)

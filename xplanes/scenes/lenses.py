@@ -1,8 +1,8 @@
-"""Lenses that bend rays: distortion of images, and its inverse.
+"""Lens distortion and its inverse.
 
-A lens maps directions to a plane one focal length behind it: x to the right and y down, in focal
-lengths. It first takes a direction at the angle theta from the optical axis to the distance
-tan(theta) from the plane's middle, a fisheye lens to theta. Then it distorts this point.
+A lens maps directions to the image plane: x to the right and y down, in focal lengths. A direction
+at the angle theta from the optical axis is projected to the distance tan(theta) from the plane's
+centre, or theta for a fisheye lens. Distortion is applied to this point.
 """
 
 import math
@@ -14,7 +14,7 @@ from torch import Tensor
 
 
 class LensModel(IntEnum):
-    """Kinds of lenses, with the names that COLMAP and OpenCV have for them."""
+    """Kinds of lenses, with their names in COLMAP and OpenCV."""
 
     PERSPECTIVE = 0
     """OpenCV's full model: PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV."""
@@ -25,35 +25,35 @@ class LensModel(IntEnum):
 
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
-"""Distortion coefficients by the names that OpenCV gives them: radial, tangential, thin prism.
+"""Distortion coefficients by their names in OpenCV: radial, tangential, thin prism.
 
-A perspective lens divides by those from k4 to k6. A fisheye lens has no k5 and k6; its k4 belongs
-to theta^8, and COLMAP's sx1 and sy1 are s1 and s3.
+For perspective lenses k4 to k6 are in the denominator. A fisheye lens has no k5 and k6; its k4 is
+the coefficient of theta^8, and COLMAP's sx1 and sy1 are s1 and s3.
 """
 
 STEEPEST = 1e3
 """Tangent of the largest angle from the optical axis at which perspective lenses are used."""
 
 WIDEST = math.radians(120)
-"""Largest field of view of the pinhole that replaces a lens where pinholes are required."""
+"""Largest field of view of a pinhole that replaces a lens."""
 
 NODES = 4096
-"""Radii at which lenses are searched for folds."""
+"""Number of radii at which the radial distortion is checked for monotonicity."""
 
 CHUNK = 1 << 16
-"""Rays at a time, few enough for their temporaries to stay in the processor's cache."""
+"""Rays per block, so that temporaries fit in the processor's cache."""
 
 
 @dataclass(frozen=True)
 class Lenses:
-    """How the lenses of some images differ from pinholes with perpendicular axes.
+    """Distortion and skew of the lenses of some images.
 
     Attributes:
         model: Kind of each lens, a `LensModel`. int64 [V]
         coefficients: Distortion, in the order of `COEFFICIENTS`. float64 [V, 12]
-        skew: Pixels to the right for each focal length down. float64 [V]
-        limit: Distance from the middle, before distortion, up to which each lens maps different
-            directions to different points; computed where it is None. float64 [V]
+        skew: Shift to the right in pixels per focal length downwards. float64 [V]
+        limit: Radius before distortion up to which each lens maps different directions to different
+            points; computed when None. float64 [V]
     """
 
     model: Tensor
@@ -78,7 +78,7 @@ class Lenses:
 
     @classmethod
     def pinholes(cls, count: int) -> "Lenses":
-        """Lenses that distort nothing."""
+        """Lenses without distortion."""
         return cls(
             torch.zeros(count, dtype=torch.int64),
             torch.zeros(count, len(COEFFICIENTS), dtype=torch.float64),
@@ -87,16 +87,16 @@ class Lenses:
 
     @property
     def are_pinholes(self) -> bool:
-        """Whether none of them distorts anything."""
+        """Whether no lens has distortion."""
         straight = self.model != LensModel.FISHEYE
         return bool(straight.all()) and not self.coefficients.any() and not self.skew.any()
 
     def __getitem__(self, indices: Tensor | slice) -> "Lenses":
-        """Those of the images at ``indices``, in that order. [K]"""
+        """The lenses of the images at ``indices``, in that order. [K]"""
         return Lenses(*(getattr(self, each.name)[indices] for each in fields(self)))
 
     def joined(self, other: "Lenses") -> "Lenses":
-        """These, then those of ``other``."""
+        """These lenses, then those of ``other``."""
         names = [each.name for each in fields(self)]
         return Lenses(*(torch.cat([getattr(self, n), getattr(other, n)]) for n in names))
 
@@ -105,11 +105,11 @@ class Lenses:
 
         Args:
             x: To the right of the principal point, in focal lengths. [R]
-            y: Downwards. [R]
+            y: Downwards, in focal lengths. [R]
 
         Returns:
             Unit vectors along the camera's axes, float64 [R, 3], and whether each point has such a
-            direction, bool [R]. Where it has none, the one nearest to it is given.
+            direction, bool [R]. If it has none, the nearest direction is returned.
         """
         x, y = torch.broadcast_tensors(x.double(), y.double())
         parts = []
@@ -137,14 +137,14 @@ class Lenses:
         return local, found
 
     def image_points(self, local: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Where the lenses map points before the camera.
+        """Project points in camera coordinates to the image plane.
 
         Args:
             local: Points along the camera's axes. [N, 3]
 
         Returns:
             Points of the image plane, to the right and down, in focal lengths, float64 [N] each,
-            and whether a ray from there leads to the point, bool [N].
+            and whether the lens maps the direction of each point to the plane, bool [N].
         """
         right, down, depth = local.double().unbind(-1)
         down, depth = -down, -depth
@@ -170,11 +170,11 @@ class Lenses:
         return x, y, seen
 
     def ball_extent(self, local: Tensor, radius: float) -> Tensor:
-        """How far balls reach from their centres, before distortion, in focal lengths.
+        """Extent of balls from their centres, before distortion, in focal lengths.
 
         Args:
             local: Centres along the camera's axes. [N, 3]
-            radius: Of the balls.
+            radius: Radius of the balls.
 
         Returns:
             An upper bound; infinity for balls that touch the camera or its plane. float64 [N]
@@ -186,7 +186,7 @@ class Lenses:
             if model == LensModel.FISHEYE:
                 clear, aside = away > radius, local[points, :2].double().norm(dim=-1)
                 angle, half = torch.atan2(aside, front), (radius / away).clamp(max=1).asin()
-                # Around the axis, then along a radius; or through the middle of the image.
+                # Along a circle around the axis, then a radius; or through the image centre.
                 turn = torch.where(aside > radius, (radius / aside).asin(), math.inf)
                 through = angle + (angle + half).clamp(max=math.pi)
                 bound = torch.minimum(half + angle * turn, through)
@@ -197,7 +197,7 @@ class Lenses:
         return extent
 
     def _by_model(self, count: int) -> list[tuple[int, Tensor | slice, "Lenses"]]:
-        """Models with their rays and the lenses of these: one for all, or one for each."""
+        """For each model: its rays and their lenses, either one for all or one for each."""
         models = self.model.unique().tolist()
         if len(models) == 1:
             return [(models[0], slice(None), self)]
@@ -208,13 +208,13 @@ class Lenses:
 
 @dataclass(frozen=True)
 class Sight:
-    """What one image with a lens sees.
+    """Field of view of an image with a lens.
 
     Attributes:
-        has_ray: Which pixels' centres a direction belongs to; None for all. bool [h, w]
-        stretch: Most by which the lens moves two points apart, as a share of their distance.
-        pinhole: Focal lengths in pixels, along x and y, of the centred pinhole that sees as wide an
-            angle between the middles of opposite edges, `WIDEST` at most.
+        has_ray: Pixels to whose centre the lens maps a direction; None for all. bool [h, w]
+        stretch: Largest factor by which distortion increases the distance of two points.
+        pinhole: Focal lengths in pixels, along x and y, of a centred pinhole with the same angle
+            between the midpoints of opposite edges, at most `WIDEST`.
     """
 
     has_ray: Tensor | None
@@ -223,7 +223,7 @@ class Sight:
 
 
 def sight(lens: Lenses, focal: Tensor, centre: Tensor, height: int, width: int) -> Sight:
-    """What an image sees through its lens.
+    """Field of view of an image through its lens.
 
     Args:
         lens: The lens.
@@ -233,7 +233,7 @@ def sight(lens: Lenses, focal: Tensor, centre: Tensor, height: int, width: int) 
         width: Columns.
     """
 
-    def look(columns: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    def unproject(columns: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         y = (rows.double() - centre[1]) / focal[1]
         x = (columns.double() - centre[0] - lens.skew * y) / focal[0]
         return lens.directions(x, y)
@@ -242,13 +242,13 @@ def sight(lens: Lenses, focal: Tensor, centre: Tensor, height: int, width: int) 
     ends = torch.tensor([0.5, width - 0.5]), torch.tensor([0.5, height - 0.5])
     border_x = torch.cat([across.repeat(2), ends[0].repeat_interleave(height)])
     border_y = torch.cat([ends[1].repeat_interleave(width), along.repeat(2)])
-    local, found = look(border_x, border_y)
+    local, found = unproject(border_x, border_y)
     has_ray = None
     if not found.all():
         rows, columns = torch.meshgrid(along, across, indexing="ij")
-        has_ray = look(columns.flatten(), rows.flatten())[1].view(height, width)
+        has_ray = unproject(columns.flatten(), rows.flatten())[1].view(height, width)
     x, y = 0.5 * width, 0.5 * height
-    edges = look(torch.tensor([0, width, x, x, x]), torch.tensor([y, y, 0, height, y]))[0]
+    edges = unproject(torch.tensor([0, width, x, x, x]), torch.tensor([y, y, 0, height, y]))[0]
     apart = torch.linalg.cross(edges[:4], edges[4:].expand(4, 3)).norm(dim=-1)
     angles = torch.atan2(apart, edges[:4] @ edges[4])
     half_x, half_y = (
@@ -262,13 +262,13 @@ def sight(lens: Lenses, focal: Tensor, centre: Tensor, height: int, width: int) 
 
 
 def _stretch(lens: Lenses, border: Tensor) -> float:
-    """Largest slope of the distortion in the circle around an image with this border. [B, 3]"""
+    """Largest derivative of the distortion in the circle around an image's border. [B, 3]"""
     omega = float(lens.coefficients[0, 0])
     if lens.model[0] == LensModel.FOV:
         return 2 * math.tan(omega / 2) / omega if omega else 1.0
     angle = torch.atan2(border[:, :2].norm(dim=-1), -border[:, 2])
     largest = float((angle if lens.model[0] == LensModel.FISHEYE else angle.tan()).max())
-    # The border's pixels reach half a pixel farther than their centres.
+    # Border pixels extend half a pixel beyond their centres.
     radius = torch.linspace(0, min(1.05 * largest, float(lens.limit)), NODES, dtype=torch.float64)
     terms = _terms(lens)
     ratio, slope = _radial(radius, terms)
@@ -280,7 +280,7 @@ def _stretch(lens: Lenses, border: Tensor) -> float:
 
 
 def _terms(lenses: Lenses) -> list[Tensor]:
-    """Coefficients by what they do: 4 in the numerator, 3 in the denominator, then p and s. [V]"""
+    """Coefficients of the radial numerator (4) and denominator (3), then p and s. [V] each"""
     k1, k2, k3, k4, k5, k6, *others = lenses.coefficients.unbind(dim=1)
     none = torch.zeros_like(k1)
     if lenses.model[0] == LensModel.FISHEYE:
@@ -331,7 +331,7 @@ def _determinant(slopes: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
 
 
 def _undo(x: Tensor, y: Tensor, lenses: Lenses) -> tuple[Tensor, Tensor, Tensor]:
-    """Points that are distorted to x and y, and whether there are any. [R] each"""
+    """Undistorted points of x and y, and whether they exist. [R] each"""
     terms, limit = _terms(lenses), lenses.limit
     target = torch.hypot(x, y)
     most = limit * _radial(limit, terms)[0]
@@ -340,8 +340,8 @@ def _undo(x: Tensor, y: Tensor, lenses: Lenses) -> tuple[Tensor, Tensor, Tensor]
     scale = torch.where(target > 0, radius / target, 1.0)
     if not any(term.any() for term in terms[7:]):
         return scale * x, scale * y, found
-    # The other terms are small. At the limit itself the slope is 0, so Newton's method begins
-    # farther inside.
+    # Initial value from the radial term, as the others are small. It lies within the limit, at
+    # which the derivative is 0.
     scale = torch.where(found, scale, 0.98 * scale)
     right, down = scale * x, scale * y
     for _ in range(50):
@@ -363,9 +363,9 @@ def _undo(x: Tensor, y: Tensor, lenses: Lenses) -> tuple[Tensor, Tensor, Tensor]
 
 
 def _undo_radial(target: Tensor, terms: list[Tensor], limit: Tensor) -> Tensor:
-    """Radii, up to the lenses' limits, that radial distortion takes to ``target``. [R]
+    """Radii, up to the lenses' limits, that radial distortion maps to ``target``. [R]
 
-    Newton's method between bounds that close in: a step that would leave them halves them instead.
+    Newton's method, safeguarded by bisection: a step that leaves the bounds is replaced by halving.
     """
     low, high = torch.zeros_like(target), limit.expand_as(target)
     radius = torch.minimum(target, high)
@@ -385,7 +385,7 @@ def _undo_radial(target: Tensor, terms: list[Tensor], limit: Tensor) -> Tensor:
 
 
 def _undo_fov(x: Tensor, y: Tensor, lenses: Lenses) -> tuple[Tensor, Tensor, Tensor]:
-    """The same for lenses of the model FOV."""
+    """`_undo` for lenses of the model FOV."""
     omega, limit = lenses.coefficients[:, 0], lenses.limit
     distorted = torch.hypot(x, y)
     slope = 2 * (omega / 2).tan()
@@ -406,7 +406,7 @@ def _apply_fov(x: Tensor, y: Tensor, lenses: Lenses) -> tuple[Tensor, Tensor]:
 
 
 def _limits(model: Tensor, coefficients: Tensor) -> Tensor:
-    """Radii at which lenses begin to fold back, or beyond which nothing is seen. [V]"""
+    """Radii up to which the lenses are invertible. [V]"""
     rows = torch.cat([model[:, None].double(), coefficients], dim=1)
     kinds, which = rows.unique(dim=0, return_inverse=True)
     found = kinds.new_empty(len(kinds))
@@ -420,7 +420,7 @@ def _limits(model: Tensor, coefficients: Tensor) -> Tensor:
 
 
 def _fold(nodes: Tensor, terms: list[Tensor]) -> float:
-    """The largest radius up to which distorted radii grow; the last node at most."""
+    """The largest radius up to which distorted radii increase, at most the last node."""
 
     def folds(radius: Tensor) -> Tensor:
         ratio, slope = _radial(radius, terms)

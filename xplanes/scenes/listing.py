@@ -1,4 +1,4 @@
-"""What every reader makes of its files: a list of posed, timed images. How these become views."""
+"""Lists of images with poses and times, which all readers return, and conversion to views."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,35 +19,35 @@ from xplanes.scenes.masks import MaskKind, MaskUse, chosen_use, ignored_pixels, 
 from xplanes.scenes.views import Intrinsics, Views, spread
 
 SHORTEST, LONGEST = 1e-3, 1e5
-"""Smallest and largest focal length, in sizes of the image."""
+"""Smallest and largest focal length, relative to the image size."""
 
 FARTHEST_ASIDE, STRONGEST = 1e3, 1e6
-"""Largest distance of a principal point, in sizes of the image, and largest coefficient."""
+"""Largest offset of a principal point, relative to the image size, and largest coefficient."""
 
 MOST_FOLDED = 0.5
-"""Share of an image's pixels that a perspective lens may map no direction to."""
+"""Largest share of an image's pixels without a ray, for perspective lenses."""
 
 Part = TypeVar("Part", "Listing", Views)
 
 SHAPE_TOLERANCE = 0.02
-"""By how much the aspect ratio of an image may differ from that of its camera."""
+"""Tolerance between the aspect ratios of an image and its camera."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """The camera of one image as a file gives it.
+    """The calibration of one image's camera, as in its file.
 
     Attributes:
         per_width: Focal length in image widths; None if ``fl_x`` is given.
         fl_x: Focal length along x in pixels of an image of ``w`` x ``h``.
-        fl_y: The same along y; None for square pixels.
+        fl_y: Focal length along y; None for square pixels.
         cx: Principal point, from the left; None for the middle.
         cy: Principal point, from the top; None for the middle.
-        w: Width of the image that these numbers refer to; None for that of the image file.
+        w: Width of the image to which these numbers refer; None for that of the image file.
         h: Its height.
         model: Kind of lens.
-        distortion: Its coefficients, in the order of `COEFFICIENTS`; none for a lens without.
-        skew: Pixels to the right for each focal length down.
+        distortion: Coefficients in the order of `COEFFICIENTS`; empty if there is no distortion.
+        skew: Shift to the right in pixels per focal length downwards.
     """
 
     per_width: float | None = None
@@ -68,10 +68,10 @@ class Calibration:
 
         Args:
             native: Height and width of the image file.
-            size: Those after it was resized.
+            size: Its final height and width.
         """
         (rows, columns), (height, width) = native, size
-        # Of an image of another size, only one side may be given.
+        # If the calibration is for another image size, only one side may be given.
         wide = self.w or (columns if self.h is None else columns * self.h / rows)
         high = self.h or (rows if self.w is None else rows * self.w / columns)
         per_width = self.per_width if self.fl_x is None else self.fl_x / wide
@@ -87,7 +87,7 @@ class Calibration:
 
     @property
     def words(self) -> str:
-        """The lens, for messages."""
+        """Description of the lens, for messages."""
         named = [
             f"{'omega' if self.model == LensModel.FOV else name}={value:g}"
             for name, value in zip(COEFFICIENTS, self.distortion, strict=False)
@@ -108,11 +108,11 @@ class Listing:
         calibrations: Focal length, principal point and lens of each image. [V]
         timed: Whether the source has times.
         masks: A mask file for each image, white where it shows the scene and black elsewhere, or
-            None for an image without; empty where there are none. [V]
-        mask_meaning: What the source defines masks as: "alpha", or "ignored" (white where pixels
-            are to be ignored); empty if it does not.
-        clear: Levels of grey, of 255, that are transparent in its images.
-        time_source: Where times come from, with examples; empty where there are none.
+            None for an image without; empty if there are none. [V]
+        mask_meaning: Meaning of masks as defined by the source: "alpha", or "ignored" (white where
+            pixels are to be ignored); empty if it does not define it.
+        clear: Grey levels, out of 255, that are transparent in its images.
+        time_source: Source of the times, with examples; empty if there are no times.
     """
 
     paths: tuple[Path, ...]
@@ -139,10 +139,10 @@ class Listing:
         times: Sequence[float],
         **more: Any,
     ) -> "Listing":
-        """A list of images that passes the checks of all formats.
+        """A list of images that has passed the checks common to all formats.
 
         Args:
-            source: Where the cameras were read, for messages.
+            source: File of the cameras, for messages.
             labels: The file and frame of each image, for messages. [V]
             paths: Image files. [V]
             poses: Camera-to-world matrices with OpenGL's axes. float64 [V, 4, 4]
@@ -150,8 +150,8 @@ class Listing:
             **more: Further attributes.
 
         Raises:
-            SceneError: If cameras lie too far away, an image is listed twice, or files have sizes
-                that do not belong together.
+            SceneError: If cameras are too far away, an image is listed twice, or the sizes of files
+                and calibrations do not match.
         """
         require_precision(source, poses[:, :3, 3])
         refuse_repeats(labels, paths, poses, times)
@@ -166,7 +166,7 @@ class Listing:
         return listing
 
     def turned(self, turn: Tensor) -> "Listing":
-        """The same in a world that is turned. float64 [3, 3]"""
+        """The listing in a rotated world. float64 [3, 3]"""
         poses = self.camera_to_world.double()
         poses[:, :3] = turn @ poses[:, :3]
         return replace(self, camera_to_world=poses.float())
@@ -181,10 +181,10 @@ class Listing:
 
 
 def time_source(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
-    """Where times come from, with examples.
+    """Description of the times' source, with examples.
 
     Args:
-        origin: Their source.
+        origin: The source.
         files: Names of the images. [V]
         times: Their times as given. [V]
     """
@@ -194,17 +194,16 @@ def time_source(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
 
 
 def held_out_places(times: Sequence[float], every: int) -> list[int]:
-    """One place in each ``every`` of views in the order of their times.
+    """Evenly spaced indices of views to hold out, one per group of ``every`` views in time.
 
-    They are evenly spread. Where several cameras see a timestep, their views follow one another in
-    turn, and the same place would always be the same camera's: places then move on from group to
-    group.
+    If several cameras observe each timestep, a fixed index within the groups could always select
+    the same camera; the index then varies from group to group.
 
     Args:
-        times: Times of the views, in order.
-        every: One in so many views is held out.
+        times: Times of the views, in ascending order.
+        every: Size of the groups.
     """
-    # Multiples of the golden ratio spread evenly, too.
+    # Multiples of the golden ratio modulo 1 are evenly spread, too.
     step = 0.5 * (math.sqrt(5) - 1) if 1 < len(set(times)) < len(times) else 0.0
     groups = range(-(-len(times) // every))
     places = (every * group + int(every * ((0.5 + step * group) % 1)) for group in groups)
@@ -212,9 +211,9 @@ def held_out_places(times: Sequence[float], every: int) -> list[int]:
 
 
 def held_out(listing: Listing, every: int) -> dict[str, list[int]]:
-    """Places of the images to train on, and of those held out as val.
+    """Indices of the training images, and of those held out as val.
 
-    One image in ``every`` is held out, by time, then file name; not the first and the last.
+    One image in ``every`` is held out, in order of time and file name; never the first or last.
     """
     times = listing.times.tolist()
     order = sorted(range(len(listing)), key=lambda index: (times[index], listing.files[index]))
@@ -227,16 +226,16 @@ def held_out(listing: Listing, every: int) -> dict[str, list[int]]:
 
 
 def thinned(part: Part, count: int | None, key: str, where: str) -> Part:
-    """``count`` views at even ranks in time, the first and the last among them.
+    """``count`` views, evenly spaced in temporal order, including the first and the last.
 
     Args:
         part: Views, or a list of images.
-        count: How many to keep; None keeps all.
-        key: The setting that asks for it, for messages.
-        where: What they are taken from, for messages.
+        count: Number of views to keep; None keeps all.
+        key: The setting with the count, for messages.
+        where: Source of the views, for messages.
 
     Raises:
-        SceneError: If there are fewer.
+        SceneError: If there are fewer views.
     """
     if count is None:
         return part
@@ -259,19 +258,19 @@ def read_views(
 ) -> Views:
     """Read the images of a listing, with their masks, and reduce them to a width.
 
-    Pixels to which a fisheye or FOV lens maps no direction, as outside of a fisheye's circle, get
-    alpha 0, and no rays are drawn from them.
+    Pixels to which a fisheye or FOV lens maps no direction, such as those outside the image circle,
+    get alpha 0 and no rays.
 
     Args:
         listing: At least one image.
         resolution: Width in pixels; None keeps the sizes of the files.
-        cache: Folder of images that are too large for memory; that of the user when None.
-        ignore: Whether pixels that masks leave out are ignored; they get alpha 0 otherwise. Images
-            without any other pixels are left out, with a warning.
-        kind: What masks mean; None determines it.
+        cache: Folder of images that are too large for memory; the user's cache when None.
+        ignore: Whether masked-out pixels are ignored; otherwise they get alpha 0. Images with only
+            ignored pixels are left out, with a warning.
+        kind: Meaning of the masks; determined from the masks when None.
 
     Raises:
-        MissingSplitError: If masks leave out all pixels of all images.
+        MissingSplitError: If all pixels of all images are masked out.
         SceneError: If a file cannot be decoded, the resolution cannot be met, or a perspective
             lens maps no direction to a pixel.
     """
@@ -305,14 +304,14 @@ def read_views(
     empty = [file for index, file in enumerate(views.files) if not views.silhouette(index).any()]
     if empty:
         warn(
-            f"{len(empty)} of {len(views)} images show nothing (alpha is next to 0 everywhere): "
+            f"{len(empty)} of {len(views)} images show nothing (alpha is near 0 everywhere): "
             f"{some(empty)} in {listing.paths[0].parent}."
         )
     return views
 
 
 def _without_ignored(listing: Listing, rest: Sequence[int]) -> Listing:
-    """The images at ``rest``; a warning names the others, whose pixels are all masked out."""
+    """The images at ``rest``; warns about the others, whose pixels are all masked out."""
     gone = [file for index, file in enumerate(listing.files) if index not in {*rest}]
     text = (
         f"masks leave out all pixels of {len(gone)} of {len(listing)} images: {some(gone)} in "
@@ -339,15 +338,15 @@ def read_splits(
         parts: The images of each split.
         resolution: As for `read_views`.
         cache: As for `read_views`.
-        mask_use: What the black parts of masks are.
-        whole: All images of the capture, whose masks mean the same in every split; those of
-            ``parts`` when None.
+        mask_use: Meaning of the black parts of masks.
+        whole: All images of the capture, from which the meaning of the masks is determined for all
+            splits; those of ``parts`` when None.
 
     Returns:
         The views of each split, `Scene.cut` and `Scene.notes`.
 
     Raises:
-        SceneError: As `read_views`; or if LRMs alone are to have masks and there are none.
+        SceneError: As `read_views`; or with mask_use lrm if there are no masks.
     """
     listings = [whole] if whole is not None else list(parts.values())
     masks = [mask for listing in listings for mask in listing.masks]
@@ -375,7 +374,7 @@ def read_splits(
 
 
 def _require_shapes(listing: Listing) -> None:
-    """Refuse images of other aspect ratios than their cameras', and masks of other sizes."""
+    """Refuse images whose aspect ratio differs from their camera's, and masks of other sizes."""
     sizes = native_sizes(listing.paths)
     shapes = map(misshapen, listing.paths, sizes, listing.calibrations)
     problems = [problem for problem in shapes if problem is not None]
@@ -393,17 +392,17 @@ def _require_shapes(listing: Listing) -> None:
 
 
 def misshapen(path: Path, size: Size, camera: Calibration) -> str | None:
-    """Why an image or a video cannot be what its camera was calibrated for; None if it can.
+    """An error message if the size of an image or video contradicts its calibration; else None.
 
     Args:
         path: The file.
         size: Its height and width.
-        camera: Its calibration, which may have a width and height of another aspect ratio.
+        camera: Its calibration.
     """
     if camera.w is None or camera.h is None:
         return None
     height, width = size
-    # Images that were made smaller have rounded sizes.
+    # A tolerance, because sizes of reduced images are rounded.
     off = abs(width * camera.h - height * camera.w)
     if off <= max(1.5 * max(camera.w, camera.h), SHAPE_TOLERANCE * width * camera.h):
         return None
@@ -413,8 +412,8 @@ def misshapen(path: Path, size: Size, camera: Calibration) -> str | None:
     )
     if (height > width) != (camera.h > camera.w) and orientation(path) in UNTURN:
         return (
-            f"{text} Its EXIF orientation says that it is to be shown turned, and the camera was "
-            "calibrated with the turned image. Pixels are read as they are stored: turn those of "
+            f"{text} Its EXIF orientation rotates it for display, and the camera was calibrated "
+            "with the rotated image. Pixels are read as they are stored: rotate those of "
             f"copies of the images (magick mogrify -auto-orient *{path.suffix})."
         )
     return (
@@ -433,12 +432,12 @@ def final_intrinsics(
 
     Args:
         labels: The images, for messages. [V]
-        calibrations: Their cameras as given. [V]
+        calibrations: Their calibrations. [V]
         native: Heights and widths of the files. [V]
-        sizes: Those after the images were resized. [V]
+        sizes: Final heights and widths. [V]
 
     Raises:
-        SceneError: If a camera is too extreme.
+        SceneError: If a camera's intrinsics are implausible.
     """
     known = [
         calibration.scaled(file, size)
@@ -464,7 +463,7 @@ def _require_real(
     centre: tuple[float, float],
     skew: float,
 ) -> None:
-    """Refuse cameras so extreme that their rays coincide or overflow."""
+    """Refuse implausible intrinsics, with which rays would coincide or overflow."""
     for axis, along, middle, pixels in zip("xy", focal, centre, reversed(size), strict=True):
         for name, value, low, high in (
             ("focal length", along / pixels, SHORTEST, LONGEST),
@@ -482,7 +481,7 @@ def _require_real(
         )
     if any(not abs(value) <= STRONGEST for value in camera.distortion):
         raise SceneError(
-            f"{label}: its {camera.words}, of which none may be beyond {STRONGEST:g}. Correct the "
+            f"{label}: its {camera.words}; no coefficient may exceed {STRONGEST:g}. Correct the "
             "camera, or calibrate again."
         )
 
@@ -492,15 +491,15 @@ def require_rays(
 ) -> None:
     """Refuse images whose lens maps no direction to most of their pixels.
 
-    Such pixels of perspective lenses are left out with a warning where they are fewer.
+    If there are only a few such pixels, a perspective lens gets a warning, and they are left out.
 
     Args:
         labels: The images, for messages. [V]
-        lenses: Their cameras as given. [V]
-        has_ray: Pixels that the lens maps a direction to, None for all. bool [h, w] each, [V]
+        lenses: Their calibrations. [V]
+        has_ray: Pixels with a ray, None for all. bool [h, w] each, [V]
 
     Raises:
-        SceneError: If there are such images; it names all of them.
+        SceneError: If there are such images; the message names all of them.
     """
     problems: list[str] = []
     folded: list[tuple[float, str]] = []
@@ -522,4 +521,4 @@ def require_rays(
     refuse_all(problems)
     if folded:
         others = len(folded) - 1
-        warn(max(folded)[1] + (f"; so are fewer of {others} other images." if others else "."))
+        warn(max(folded)[1] + (f"; {others} other images lose fewer." if others else "."))

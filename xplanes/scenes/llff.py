@@ -1,4 +1,4 @@
-"""Captures in the format of LLFF: poses_bounds.npy, and a folder with an image for each row."""
+"""Captures in the format of LLFF: poses_bounds.npy, and a folder with one image per row."""
 
 import math
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.views import Scene
 
 DYNAMIC = ("motion_masks", "mv_images", "flow_i1", "flow", "disp")
-"""Folders of the methods for dynamic scenes that use this format, such as NSFF and DynamicNeRF."""
+"""Folders of dynamic scenes in this format, as used by NSFF and DynamicNeRF."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LlffSettings(CaptureSettings):
-    """A capture in the format of LLFF, static unless folders for dynamic scenes lie beside it."""
+    """A capture in the format of LLFF; static unless it has folders of a dynamic scene."""
 
     files: ClassVar = "poses_bounds.npy and a folder images with an image for each of its rows"
 
@@ -64,7 +64,7 @@ def _image_folders(folder: Path) -> list[list[Path]]:
 
 
 def _chosen(folders: Sequence[list[Path]], resolution: int | None) -> list[Path]:
-    """The smallest images that are at least as wide as asked for; the largest without such."""
+    """The smallest images that are at least as wide as requested; else the largest ones."""
     widths = [native_sizes(images[:1])[0][1] for images in folders]
     wanted = math.inf if resolution is None else resolution
     enough = [place for place, width in enumerate(widths) if width >= wanted]

@@ -1,4 +1,4 @@
-"""Mask files: what their values and black parts mean, decided for a whole capture."""
+"""Mask files: the meaning of their values and black parts, determined for a whole capture."""
 
 import logging
 from collections.abc import Sequence
@@ -24,58 +24,58 @@ from xplanes.scenes.formats import (
 logger = logging.getLogger(__name__)
 
 MaskUse = Literal["auto", "alpha", "ignore", "lrm"]
-"""What the black parts of masks mean.
+"""Meaning of the black parts of masks.
 
-alpha: empty space; ignore: pixels to ignore; lrm: removed from the LRM's input alone; auto: empty
-space where masks look like silhouettes, else pixels to ignore.
+alpha: empty space; ignore: pixels to ignore; lrm: removed only from the LRM's input; auto: empty
+space if masks look like silhouettes, else pixels to ignore.
 """
 
 SURVEYED = 32
-"""Masks of a capture that are sampled to determine what its masks mean."""
+"""Number of masks that are sampled to determine the meaning of a capture's masks."""
 
 LOOK = 512
-"""Rows and columns of each of them that are sampled."""
+"""Number of rows and columns that are sampled in each mask."""
 
 COLOURED = 16
-"""Difference of channels above which a mask is coloured; grey JPEGs stay below."""
+"""Difference between channels above which a mask is coloured; grey JPEGs stay below it."""
 
 MOST_LABELS = 64
-"""Most distinct values in a capture's masks if these are labels of objects."""
+"""Largest number of distinct values if masks contain object labels."""
 
 WHITE = 0.94
-"""Share of the largest possible value that labels do not exceed."""
+"""Largest label, as a share of the largest possible value."""
 
 LOSSY = ("JPEG", "MPO", "WEBP", "AVIF", "JPEG2000")
-"""Formats whose values are only near the original ones."""
+"""Lossy formats, which change values slightly."""
 
 RUNS = 0.6
-"""Least share of a mask's pixels with a neighbour of the same value, if these are labels."""
+"""Least share of pixels with a neighbour of the same value, if masks contain labels."""
 
 NOISE = 8 / 255
-"""Largest difference from black and from white that lossy formats and videos make."""
+"""Largest deviation from black and white in lossy formats and videos."""
 
 SILHOUETTE_EDGE, UNCLEAR = 0.5, (0.4, 0.7)
-"""Least share of the images' edges that silhouettes leave out, and shares that may mean either."""
+"""Least masked-out share of the images' edges for silhouettes, and range of ambiguous shares."""
 
 HIDDEN = 0.8
-"""Share of the images' middle above which masks may be silhouettes in black on white."""
+"""Masked-out share of the images' middle above which masks may be inverted silhouettes."""
 
 KEPT = 0.9
-"""Share of a pixel that a mask must show for the pixel not to be ignored."""
+"""Mask coverage of a pixel below which it is ignored."""
 
 
 @dataclass(frozen=True)
 class MaskKind:
-    """What the masks of a capture mean.
+    """Meaning of the masks of a capture.
 
     Attributes:
-        labels: Whether their values are labels of objects, all of which but 0 belong to the mask.
-        edge: Share of the pixels at the images' edges that they leave out.
-        share: Share of all pixels that they leave out.
-        inverted: Whether they leave out what is white.
-        middle: Share of the pixels in the images' middle that they leave out.
-        shared: Whether several images share a file, which cannot be a silhouette then.
-        equal: Whether masks of several images are equal, although their files are not.
+        labels: Whether values are object labels; all except 0 belong to the foreground.
+        edge: Masked-out share of the pixels at the images' edges.
+        share: Masked-out share of all pixels.
+        inverted: Whether white pixels are masked out.
+        middle: Masked-out share of the pixels in the images' middle.
+        shared: Whether several images share a mask file, which then cannot be a silhouette.
+        equal: Whether masks of several images are equal, although their files are separate.
     """
 
     labels: bool
@@ -88,12 +88,12 @@ class MaskKind:
 
     @property
     def use(self) -> Literal["alpha", "ignore"]:
-        """What their black parts are: empty where they are silhouettes, else to be ignored."""
+        """Meaning of the black parts: empty if the masks are silhouettes, else to be ignored."""
         return "alpha" if self.edge >= SILHOUETTE_EDGE and not self.shared else "ignore"
 
     @property
     def is_unclear(self) -> bool:
-        """Whether they may be either."""
+        """Whether the meaning is ambiguous."""
         if self.shared:
             return False
         if self.edge >= SILHOUETTE_EDGE:
@@ -102,11 +102,11 @@ class MaskKind:
 
 
 def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
-    """Determine from some masks of a capture what all of them mean.
+    """Determine the meaning of a capture's masks from a sample of them.
 
     Args:
         masks: A file for each image, or None. [V]
-        inverted: Whether they leave out what is white.
+        inverted: Whether white pixels are masked out.
 
     Raises:
         SceneError: If a mask cannot be decoded.
@@ -119,7 +119,7 @@ def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
     stored = []
     for path in files:
         grey, lossy = _stored(path)
-        # Lossy formats have no labels, whose numbers must be exact.
+        # Labels need exact values, which lossy formats do not preserve.
         may_be = not lossy and _has_regions(grey)
         numbers |= set(np.unique(grey).tolist()) if may_be else {1}
         stride = -(-max(grey.shape) // LOOK)
@@ -133,7 +133,7 @@ def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
         contents.add(hash(out.tobytes()))
         shares.append(float(out.mean()))
         if out.all() and (edges or place < len(stored) - 1):
-            continue  # All black: it has no shape.
+            continue  # An all-black mask tells nothing.
         rim = np.concatenate([out[0], out[-1], out[1:-1, 0], out[1:-1, -1]])
         edges.append(float(rim.mean()))
         rows, columns = (slice(round(0.45 * n), round(0.55 * n) + 1) for n in out.shape)
@@ -152,13 +152,13 @@ def _has_regions(grey: np.ndarray) -> bool:
 
 
 def chosen_use(use: MaskUse, kind: MaskKind, where: str, told: str = "") -> tuple[MaskUse, str]:
-    """The use of a capture's masks, and a sentence about it; warns if it may be another.
+    """The use of a capture's masks, and a description; warns if it is ambiguous.
 
     Args:
         use: The setting ``data.mask_use``.
-        kind: What `survey` found.
-        where: Where the masks are, for messages.
-        told: What their source defines them as, "alpha" or "ignored"; empty if it does not.
+        kind: Result of `survey`.
+        where: Source of the masks, for messages.
+        told: Meaning as defined by their source, "alpha" or "ignored"; empty if undefined.
     """
     if use == "lrm":
         return use, "for LRMs alone (data.mask_use=lrm)"
@@ -184,14 +184,14 @@ def chosen_use(use: MaskUse, kind: MaskKind, where: str, told: str = "") -> tupl
 
 
 def read_mask(path: Path, kind: MaskKind, image: Path | None = None) -> np.ndarray:
-    """A mask as factors from 0, for what it leaves out, to 1. float32 [H, W]
+    """A mask as factors from 0 (masked out) to 1. float32 [H, W]
 
-    Transparent masks count by their alpha; in coloured ones all but black belongs to the mask.
+    Masks with transparency are read from alpha; in coloured masks only black is masked out.
 
     Args:
         path: The file.
-        kind: What the masks of its capture mean.
-        image: The image whose size it must have; None for any size.
+        kind: Meaning of the capture's masks.
+        image: The image whose size the mask must have; None for any size.
 
     Raises:
         SceneError: If it cannot be decoded, or has another size.
@@ -203,7 +203,7 @@ def read_mask(path: Path, kind: MaskKind, image: Path | None = None) -> np.ndarr
 
 
 def _factors(grey: np.ndarray, kind: MaskKind) -> np.ndarray:
-    """What `read_mask` makes of the values of a mask. float32 [H, W]"""
+    """Convert the values of a mask to factors, see `read_mask`. float32 [H, W]"""
     values = (grey > 0).astype(np.float32) if kind.labels else grey.copy()
     values[values < NOISE], values[values > 1 - NOISE] = 0, 1
     return 1 - values if kind.inverted else values
@@ -215,7 +215,7 @@ def ignored_pixels(
     sizes: Sequence[tuple[int, int]],
     kind: MaskKind,
 ) -> Tensor:
-    """Pixels of reduced images that masks leave out, in part at least, with padding. bool [V, H, W]
+    """Pixels of reduced images that are at least partly masked out, padded. bool [V, H, W]
 
     Args:
         masks: A file for each image, or None. [V]
@@ -247,7 +247,7 @@ def _stored(path: Path) -> tuple[np.ndarray, bool]:
 
 
 def _grey(picture: Image.Image) -> np.ndarray:
-    """The values of a mask as they are stored; of coloured ones 255 for all but black. [H, W]"""
+    """The stored values of a mask; for coloured masks, 255 except for black. [H, W]"""
     if picture.mode in SIXTEEN_BIT_MODES:
         return np.asarray(picture)
     colours = np.asarray(picture.convert("RGBA"))

@@ -1,28 +1,28 @@
-"""The silhouette of an image: what its alpha shows, without the noise of soft mattes."""
+"""The silhouette of an image: its visible alpha, without the noise of soft mattes."""
 
 import numpy as np
 from torch import Tensor
 
 VISIBLE = 20
-"""Alpha, of 255, from which a pixel shows something: far above the noise of mattes, far below half,
-so that hair, glass and thin edges stay."""
+"""Alpha, out of 255, from which a pixel is visible: far above the noise of mattes, but far below
+one half, so that hair, glass and thin edges are kept."""
 
 FAINT = 6
-"""The same in an image with hardly any opaque pixels, whose content may be faint."""
+"""Threshold for an image with hardly any opaque pixels, whose content may be faint."""
 
 OPAQUE, OPAQUE_SHARE = 64, 1e-3
-"""Alpha of opaque content; share of the pixels that has it at least, unless the image is faint."""
+"""Alpha of opaque content; an image with a smaller share of such pixels counts as faint."""
 
 NOISE, SMALLER = 0.01, 5
-"""Largest extent of a region that is noise, as a share of the image's longer side; how many times
-as large the largest region is at least. Wires are longer, and what is small and alone is the
-largest itself."""
+"""A region is noise if its extent is below this share of the image's longer side, and the largest
+region is at least this many times as large. Thus wires are kept, being long, and so is a small
+object that is alone."""
 
 
 def silhouette_of(alpha: Tensor) -> Tensor:
     """The pixels of an image that belong to its silhouette.
 
-    These are the connected regions of visible alpha, without those so small that they are noise.
+    These are the connected regions of visible alpha, except for small ones, which are noise.
     Antialiased and soft edges end where alpha falls below `VISIBLE`.
 
     Args:
@@ -39,9 +39,9 @@ def silhouette_of(alpha: Tensor) -> Tensor:
 
 
 def _remove_noise(mask: np.ndarray) -> None:
-    """Clear regions that are far smaller than the image and than the largest one. bool [h, w]"""
+    """Clear regions far smaller than the image and the largest region. bool [h, w]"""
     height, width = mask.shape
-    # Rows are two pixels longer here, so that runs of different rows never touch by number.
+    # Rows are padded by two pixels, so that runs of adjacent rows do not have adjacent indices.
     pitch = width + 2
     padded = np.zeros((height, pitch), np.int8)
     padded[:, 1:-1] = mask
@@ -65,18 +65,18 @@ def _remove_noise(mask: np.ndarray) -> None:
 
 
 def _regions(first: np.ndarray, end: np.ndarray, pitch: int) -> np.ndarray:
-    """Number of the region of each run of pixels; runs touch across corners, too.
+    """Label the connected region of each run of pixels (8-connected).
 
     Args:
-        first: Number of each run's first pixel, ascending, if rows are ``pitch`` pixels long. [N]
-        end: Number of the pixel after its last one. [N]
-        pitch: Pixels of a row; the last two are never in a run.
+        first: Index of each run's first pixel, ascending, in rows of ``pitch`` pixels. [N]
+        end: Index after its last pixel. [N]
+        pitch: Pixels per row; the last two are never in a run.
 
     Returns:
         int64 [N]
     """
     region = np.arange(len(first))
-    # The runs that each touches in the row below lie side by side in the order of runs.
+    # The runs that touch a run from the row below are consecutive.
     begin = np.searchsorted(end, first + pitch)
     touched = np.searchsorted(first, end + pitch, side="right") - begin
     above = region.repeat(touched)

@@ -1,9 +1,8 @@
 """Videos of several fixed cameras: Neural 3D Video, or a folder with a calibration.
 
-Neural 3D Video keeps the calibration in poses_bounds.npy and the cameras as cam00.mp4, cam01.mp4,
-... in the same order. In other folders a transforms.json names each camera's video, its folder of
-images, or one of these images; or COLMAP has registered one image of each camera, of the camera's
-name.
+Neural 3D Video has the calibration in poses_bounds.npy and the videos cam00.mp4, cam01.mp4, ... in
+the same order. In other folders a transforms.json names each camera's video, its folder of images,
+or one of these images; or COLMAP has registered one image per camera, with the name of the camera.
 """
 
 import logging
@@ -58,16 +57,16 @@ POSES = "poses_bounds.npy"
 TRANSFORMS = "transforms.json"
 
 NUMBERED = re.compile(r"(?i)((view|camera|c|v)[_-]?\d+|\d\d+)")
-"""Names of cameras that are not called cam*."""
+"""Pattern of camera names other than cam*."""
 
 IMAGES = ("images", "image", "rgb", "frames")
-"""Folders of a camera that hold its images, where there are others beside them."""
+"""Names of the subfolder with a camera's images, if the camera has several subfolders."""
 
 SAME_RATE = 1e-3
-"""Share by which frame rates of synchronised cameras differ at most."""
+"""Largest relative difference between frame rates of synchronised cameras."""
 
 LATE = 1.5
-"""How many times the median a gap between frames is if the rate varies."""
+"""A longer gap between frames, relative to the median gap, indicates a variable frame rate."""
 
 SAME_POSE = 1e-4
 """Largest difference between poses of a fixed camera."""
@@ -83,9 +82,9 @@ class MultiCameraSettings(SceneSettings):
     )
 
     frames: list[int] | None  # First frame, last frame and stride; null for all frames.
-    # Names of the held-out cameras: scored, not trained on. null: cam00, or else the most central.
+    # Names of held-out cameras, which are scored only. null: cam00, or else the most central one.
     test_cameras: list[str] | None
-    video_camera: str | None  # Camera whose video the LRM sees; null: the most central one.
+    video_camera: str | None  # Camera whose video the LRM is given; null: the most central one.
     # Rotate the world so that the cameras' mean up vector becomes its z axis. null: if that is more
     # than 60 degrees from it.
     orient: bool | None
@@ -153,14 +152,14 @@ class MultiCameraSettings(SceneSettings):
 
 @dataclass(frozen=True)
 class Camera:
-    """A fixed camera and what it recorded.
+    """A fixed camera and the source of its frames.
 
     Attributes:
         name: Name of its video, or of its folder of images.
-        source: The video or the folder.
+        source: The video, or the folder of images.
         pose: Camera-to-world matrix with OpenGL's axes. float64 [4, 4]
         calibration: Its focal length, principal point and lens.
-        label: The file and entry that calibrate it, for messages.
+        label: The file and entry of its calibration, for messages.
     """
 
     name: str
@@ -180,7 +179,7 @@ class Recording:
         count: Number of frames.
         rate: Frames per second; None for images and if the video has none.
         images: The image files in the order of time; empty for a video. [count]
-        times: Seconds at which a video shows its frames; empty where that is not known. [count]
+        times: Presentation times of a video's frames in seconds; empty if unknown. [count]
     """
 
     camera: Camera
@@ -192,7 +191,7 @@ class Recording:
 
     @property
     def step(self) -> float:
-        """Median seconds between frames; 0 where that is not known."""
+        """Median seconds between frames; 0 if unknown."""
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
 
 
@@ -218,13 +217,13 @@ def read_cameras(folder: Path) -> list[Camera]:
     names = [camera.name for camera in cameras]
     if twice := [name for name in names if names.count(name) > 1]:
         raise SceneError(
-            f"{folder}: several cameras are called {twice[0]}. Name their videos or folders apart."
+            f"{folder}: several cameras are called {twice[0]}. Rename their videos or folders."
         )
     return cameras
 
 
 def recordings_of_cameras(folder: Path) -> list[Path]:
-    """Videos and folders of the names cam*, or else of numbers such as 00 or view_01, by name."""
+    """Videos and folders called cam*, else those with numbers such as 00 or view_01, by name."""
     inside = sorted(filter(_is_recording, folder.iterdir()))
     numbered = [path for path in inside if NUMBERED.fullmatch(path.stem)]
     numbered.sort(key=lambda path: natural(path.name))
@@ -232,7 +231,7 @@ def recordings_of_cameras(folder: Path) -> list[Path]:
 
 
 def _recordings(folder: Path) -> list[Path]:
-    """The same in a folder, or in the only one in it that has some, such as videos."""
+    """Recordings in a folder, or in its only subfolder that has some, such as videos."""
     if found := recordings_of_cameras(folder):
         return found
     deeper = [recordings_of_cameras(path) for path in folder.iterdir() if path.is_dir()]
@@ -241,9 +240,9 @@ def _recordings(folder: Path) -> list[Path]:
 
 
 def is_rig(folder: Path) -> bool:
-    """Whether the frames of transforms.json are of different videos or folders of several images.
+    """Whether the frames of transforms.json name different videos or folders of several images.
 
-    Then they are cameras, not a capture of as many images.
+    If so, they are cameras rather than the images of a capture.
     """
     sources: set[Path] = set()
     try:
@@ -262,9 +261,9 @@ def _is_recording(path: Path) -> bool:
 
 
 def _from_poses_bounds(folder: Path) -> list[Camera]:
-    """Cameras of poses_bounds.npy, whose rows belong to the videos or folders cam* by name."""
+    """Cameras of poses_bounds.npy; its rows are in the order of the videos' or folders' names."""
     path = folder / POSES
-    # A video may lie beside a folder of images made of it.
+    # A video may be beside a folder of images extracted from it.
     sources = list({source.stem: source for source in _recordings(folder)}.values())
     rows = read_poses_bounds(path, [source.name for source in sources])
     return [
@@ -280,7 +279,7 @@ def read_poses_bounds(
 
     Args:
         path: The file.
-        names: Images, videos or folders that the rows are of, in order.
+        names: Images, videos or folders of the rows, in order.
 
     Raises:
         SceneError: If it cannot be read, or has another number of rows.
@@ -319,7 +318,7 @@ def read_poses_bounds(
 
 
 def _from_transforms(folder: Path) -> list[Camera]:
-    """Cameras of transforms.json: a frame for each, or several with one pose."""
+    """Cameras of transforms.json: one frame per camera, or several with the same pose."""
     path = folder / TRANSFORMS
     content = read_frames(path)
     cameras: dict[Path, Camera] = {}
@@ -340,14 +339,14 @@ def _from_transforms(folder: Path) -> list[Camera]:
 
 
 def _from_colmap(folder: Path, place: Path) -> list[Camera]:
-    """Cameras of a sparse model in which one image of each is registered."""
+    """Cameras of a sparse model with one registered image per camera."""
     model = read_model(place)
     require_precision(model.source, model.camera_to_world[:, :3, 3])
     sources: dict[str, list[Path]] = defaultdict(list)
     for path in sorted(folder.iterdir()):
         if _is_recording(path):
             sources[path.stem].append(path)
-    # Other folders, such as images and sparse, need be no cameras.
+    # Other folders, such as images and sparse, need not be cameras.
     expected = {path for paths in sources.values() for path in paths if path.is_file()}
     expected = sorted(expected | set(recordings_of_cameras(folder)))
     owned: dict[Path, list[str]] = {path: [] for path in expected}
@@ -359,7 +358,7 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
         found = [
             path
             for text in dict.fromkeys((image.stem, image.parent.name))
-            # A video may lie beside a folder of images made of it.
+            # A video may be beside a folder of images extracted from it.
             for path in [path for path in sources[text] if path.is_file()] or sources[text]
         ]
         for path in found:
@@ -394,8 +393,8 @@ def _source(label: str, folder: Path, name: Any) -> Path:
     else:
         raise SceneError(
             f"{label}: {folder / name} is no video ({', '.join(videos.SUFFIXES)}), no folder "
-            "of images and no image in a folder of the camera's own. Add it, or take the frame "
-            "out of the list."
+            "of images and no image in a folder of one camera. Add it, or remove the frame "
+            "from the list."
         )
     if source == folder:
         raise SceneError(f"{label}: file_path is the scene's folder, not that of one camera.")
@@ -405,7 +404,7 @@ def _source(label: str, folder: Path, name: Any) -> Path:
 def _split_cameras(
     folder: Path, cameras: Sequence[Camera], test_cameras: Sequence[str] | None
 ) -> dict[str, list[int]]:
-    """Numbers of the cameras of each split."""
+    """Indices of each split's cameras."""
     names = [camera.name for camera in cameras]
     if test_cameras is None:
         chosen = "cam00" if "cam00" in names else names[int(_distances(cameras).argmin())]
@@ -431,13 +430,13 @@ def _split_cameras(
 
 
 def _distances(cameras: Sequence[Camera]) -> np.ndarray:
-    """How far each camera is from the middle of all. [V]"""
+    """Distance of each camera from the centre of all. [V]"""
     places = np.stack([camera.pose[:3, 3] for camera in cameras])
     return np.linalg.norm(places - places.mean(axis=0), axis=1)
 
 
 def _video_camera(cameras: Sequence[Camera], parts: dict[str, list[int]], name: str | None) -> int:
-    """Number of the camera whose video the LRM sees."""
+    """Index of the camera whose video the LRM is given."""
     train = parts["train"]
     if name is None:
         away = _distances(cameras)
@@ -453,7 +452,7 @@ def _video_camera(cameras: Sequence[Camera], parts: dict[str, list[int]], name: 
 
 
 def _recording(camera: Camera) -> Recording:
-    """What a camera recorded, from headers alone."""
+    """The frames of a camera, read from headers only."""
     if camera.source.is_file():
         video = videos.read_header(camera.source)
         rate = None if video.rate is None else float(video.rate)
@@ -475,7 +474,7 @@ def _recording(camera: Camera) -> Recording:
 
 
 def _images_in(folder: Path) -> list[Path]:
-    """Images of a folder, or of the one in it, in the order of the numbers in their names."""
+    """Images of a folder, or of its only subfolder, in the order of the numbers in their names."""
     inside = sorted(folder.iterdir(), key=lambda path: natural(path.name))
     if found := [path for path in inside if is_image(path)]:
         return found
@@ -486,10 +485,10 @@ def _images_in(folder: Path) -> list[Path]:
 
 
 def _are_stamped(recordings: Sequence[Recording]) -> bool:
-    """Whether times are those of the files, as where rates differ, or vary within a video.
+    """Whether to use the files' time stamps: if frame rates differ, or vary within a video.
 
-    Elsewhere frames of one number are of one time. A warning tells of videos that begin at
-    different times then.
+    Otherwise frames with the same number are simultaneous; warns if videos begin at different
+    times.
 
     Raises:
         SceneError: If rates differ and a recording has no times.
@@ -505,7 +504,7 @@ def _are_stamped(recordings: Sequence[Recording]) -> bool:
     if other is not None:
         raise SceneError(
             f"{other[0]} has {other[1]:g} frames per second, but {timed[0][0]} {timed[0][1]:g}, "
-            "and not all cameras' files tell the times of their frames. Encode all videos at one "
+            "and not all cameras' files have times of their frames. Encode all videos at one "
             f"rate: ffmpeg -i {other[0].name} -r {timed[0][1]:g} NEW.mp4"
         )
     begun = [(r.times[0], r.camera.source, r.step) for r in recordings if r.times]
@@ -513,17 +512,17 @@ def _are_stamped(recordings: Sequence[Recording]) -> bool:
         (early, first, step), (late, last, _) = min(begun), max(begun)
         if late - early > 0.5 * step > 0:
             warn(
-                f"{last} begins {late - early:.3g} s after {first}: frames of one number are taken "
-                "to be of one time. If they are not, cut the videos to one beginning."
+                f"{last} begins {late - early:.3g} s after {first}: frames of equal number are "
+                "taken to be simultaneous. If they are not, trim the videos to a common start."
             )
     return False
 
 
 def _require_same_frames(recordings: Sequence[Recording]) -> None:
-    """Refuse folders of numbered images where a camera lacks some in the middle.
+    """Refuse folders of numbered images if a camera lacks some in the middle.
 
-    Its later frames would be paired with earlier ones of other cameras. Numbering may start
-    anywhere, and some cameras may have stopped early.
+    Its later frames would be paired with earlier ones of other cameras. Numbering may start at any
+    number, and some cameras may have stopped early.
     """
     first: tuple[Recording, list[int]] | None = None
     for recording in recordings:
@@ -538,15 +537,15 @@ def _require_same_frames(recordings: Sequence[Recording]) -> None:
                 raise SceneError(
                     f"{recording.camera.source}: image number {place + 1} is {paths[0].name}, but "
                     f"{paths[1].parent.name}/{paths[1].name} in {first[0].camera.name}. One of the "
-                    "cameras lacks a frame before it, and frames must be of one time: add it, or "
-                    "take the frame out of all cameras."
+                    "cameras lacks a frame before it, and frames must be simultaneous: add it, or "
+                    "remove the frame from all cameras."
                 )
 
 
 def _frame_numbers(
     folder: Path, recordings: Sequence[Recording], frames: Sequence[int] | None, stamped: bool
 ) -> list[range]:
-    """Numbers of the frames to read of each camera: the same ones, unless they have own times."""
+    """Frames to read of each camera: the same numbers, unless they have their own times."""
     _require_same_frames(recordings)
     shortest = min(recordings, key=lambda recording: recording.count)
     longest = max(recordings, key=lambda recording: recording.count)
@@ -631,7 +630,7 @@ def _read_views(
 def _job(
     recording: Recording, numbers: range, size: Size, shown: Tensor | None, place: int
 ) -> store.Job:
-    """Decodes the frames of a camera, which are the images from number ``place`` on."""
+    """Job that decodes the frames of a camera to the images from index ``place`` on."""
 
     def decode() -> Iterator[tuple[int, np.ndarray]]:
         if recording.images:
@@ -646,7 +645,7 @@ def _job(
 
 
 def _reduced(frame: np.ndarray, size: Size) -> np.ndarray:
-    """A video's frame in its final size. uint8 [h, w, 3] -> [H, W, 3 or 4]"""
+    """A video frame, reduced to its final size. uint8 [h, w, 3] -> [H, W, 3 or 4]"""
     if frame.shape[:2] == size:
         return frame
     channels = np.full((4, *frame.shape[:2]), 255, np.float32)

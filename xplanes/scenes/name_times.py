@@ -17,7 +17,7 @@ OTHER_TIMES = (
 )
 
 FEW = 0.5
-"""Share of a folder's images below which the number of distinct times is suspicious."""
+"""Ratio of distinct times to images in a folder below which times are suspicious."""
 
 CAMERA = re.compile(
     r"(?i)(?<![a-z])(cam|camera|view|lens|sensor|rig)s?[_\- ]*\d+(?![a-z\d])"
@@ -38,11 +38,11 @@ Number = int | float
 
 
 def times_in_names(names: Sequence[str]) -> list[Number]:
-    """Times of images, in any unit, from their names; none, with a warning, if these have none.
+    """Times of images, in any unit, from their names; empty, with a warning, if there are none.
 
-    They are dates and times of day, seconds with a fraction, or else the number that differs most
-    among the names and is no camera's. A warning shows names and times where their orders disagree,
-    or there are far fewer times than images.
+    Times are dates with the time of day, seconds with a fraction, or else the number that varies
+    most among the names and is not that of a camera. Warns, with examples, if times are not in the
+    order of the names, or if there are far fewer times than images.
 
     Args:
         names: Names of the images, with their folders. [V]
@@ -53,7 +53,7 @@ def times_in_names(names: Sequence[str]) -> list[Number]:
         found = [time for time in times if time is not None]
         if len(found) == len(names) and not _few(names, found):
             return _checked(names, found)
-    # In folders of timesteps, file names are those of cameras.
+    # If each folder is a timestep, file names are those of cameras.
     paths = [PurePosixPath(name).with_suffix("").as_posix() for name in names]
     bare = [[CAMERA.sub("", text) for text in texts] for texts in (stems, paths)]
     for texts in (*bare, stems):
@@ -86,9 +86,9 @@ def _clock(stem: str) -> float | None:
 
 
 def _most_different(texts: Sequence[str]) -> list[Number]:
-    """The number in each name at the place where numbers differ most, the last of such places.
+    """The number in each name at the position where numbers vary most, the last one of equals.
 
-    None where a name has no number.
+    None for a name without a number.
     """
     rows = [re.findall(r"\d+", text) for text in texts]
     if not all(rows):
@@ -101,11 +101,11 @@ def _most_different(texts: Sequence[str]) -> list[Number]:
 
 
 def _no_series(names: Sequence[str], stems: Sequence[str], found: Sequence[Number]) -> str | None:
-    """Why names are not those of a series of images, such as hashes; None if they are."""
+    """Why names, such as hashes, do not form a series of images; None if they do."""
     bare = [name for name in names if not re.search(r"\d", name)]
     if bare:
         return f"The names of {len(bare)} of {len(names)} images have no number, such as {bare[0]}"
-    # All names of a series are equal but for their numbers.
+    # Names of a series differ only in their numbers.
     kinds = {re.sub(r"\d+", "#", stem) for stem in stems}
     if len(kinds) > max(4, len(names) // 2):
         return f"The names of the images, such as {some(names)}, differ in more than their numbers"
@@ -115,7 +115,7 @@ def _no_series(names: Sequence[str], stems: Sequence[str], found: Sequence[Numbe
 
 
 def _folders(names: Sequence[str]) -> list[list[int]]:
-    """Places of the images of each folder and camera, in the order of their names without it."""
+    """Indices of the images of each folder and camera, in the order of their names."""
     folders: dict[tuple[str, ...], list[int]] = defaultdict(list)
     for place in sorted(range(len(names)), key=lambda i: natural(CAMERA.sub("", names[i]))):
         path = PurePosixPath(names[place])
@@ -130,7 +130,7 @@ def _few(names: Sequence[str], times: Sequence[Number]) -> bool:
 
 
 def _checked(names: Sequence[str], times: list[Number]) -> list[Number]:
-    """The times, with a warning if they are unlikely."""
+    """The times; warns if they are implausible."""
     why, shown = "", list(range(min(3, len(names))))
     for places in _folders(names):
         back = [pair for pair in pairwise(places) if times[pair[1]] < times[pair[0]]]

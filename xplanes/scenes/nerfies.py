@@ -1,4 +1,4 @@
-"""Captures in the format of Nerfies, HyperNeRF and DyCheck: a camera file for each image."""
+"""Captures in the format of Nerfies, HyperNeRF and DyCheck: one camera file per image."""
 
 import logging
 import math
@@ -33,7 +33,7 @@ from xplanes.settings import Location
 logger = logging.getLogger(__name__)
 
 TIMES = ("time_id", "warp_id", "appearance_id")
-"""Keys of metadata.json that count timesteps; the first that all images have is taken."""
+"""Keys of the timestep in metadata.json; the first one that all images have is used."""
 
 EXAMPLE = '{"warp_id": 0, "camera_id": 0}'
 """An entry of metadata.json."""
@@ -79,7 +79,7 @@ class NerfiesSettings(CaptureSettings):
     def _listing(
         self, names: Sequence[str], pictures: str
     ) -> tuple[Listing, Sequence[str], np.ndarray | None]:
-        """Images in a folder of rgb, the names of those that are not left out, and points."""
+        """Images in a folder of rgb, the names of usable ones, and points."""
         folder = self.folder
         root = folder.resolve()
         scale, centre = _scene(folder / "scene.json")
@@ -124,7 +124,7 @@ class NerfiesSettings(CaptureSettings):
         return listing, names, points
 
     def _times(self, names: Sequence[str], metadata: Mapping[str, Any]) -> tuple[list[float], str]:
-        """Times from 0 to 1, and where they come from; none where the scene is static."""
+        """Times from 0 to 1, and their source; no times if the scene is static."""
         if self.static:
             return [], ""
         path, entries = self.folder / "metadata.json", [metadata[name] for name in names]
@@ -146,9 +146,9 @@ class NerfiesSettings(CaptureSettings):
 
 
 def _splits(folder: Path, protocol: str | None) -> tuple[dict[str, list[str]], Path]:
-    """Names of the images to train on and of those to score, and the file that lists them.
+    """Names of the training images and of those to score, and the file that lists them.
 
-    Where none are listed to score, all images are to train on.
+    If no images are listed for scoring, all images are training images.
     """
     ending = "" if protocol is None else f"_{protocol}"
     path = folder / "splits" / f"train{ending}.json"
@@ -180,8 +180,8 @@ def _splits(folder: Path, protocol: str | None) -> tuple[dict[str, list[str]], P
     shared = sorted(set(found["train"]) & set(found.get("val", ())))
     if shared:
         raise SceneError(
-            f"{path}: {len(shared)} images are to be trained on and to be scored: {some(shared)}. "
-            "Take them out of one of the two lists."
+            f"{path}: {len(shared)} images are listed both for training and for scoring: "
+            f"{some(shared)}. Remove them from one of the two lists."
         )
     return found, path
 
@@ -204,7 +204,7 @@ def _names(path: Path, content: Mapping[str, Any], key: str) -> list[str]:
 
 
 def _scene(path: Path) -> tuple[float, np.ndarray]:
-    """How positions become those of the scene: ``(position - centre) * scale``."""
+    """Scale and centre that normalise positions: ``(position - centre) * scale``."""
     content = read_object(path, "scale and center")
     scale = content.get("scale")
     if not is_positive(scale):
@@ -259,7 +259,7 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
             f"{DOWNLOAD}"
         )
     centre_x, centre_y = _numbers(path, content, "principal_point", 2)
-    # The first captures were written with another name.
+    # The first captures use another key.
     tangential = "tangential" if "tangential" in content else "tangential_distortion"
     none = {"radial_distortion": [0, 0, 0], tangential: [0, 0]}
     k1, k2, k3 = _numbers(path, none | content, "radial_distortion", 3)
@@ -279,10 +279,10 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
 
 
 def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) -> str:
-    """The folder in rgb of the smallest images that are at least as wide as asked for.
+    """The folder in rgb of the smallest images that are at least as wide as requested.
 
-    Without such images, or a width, the largest ones. If images of that scale are missing, the
-    scale that lacks the fewest takes its place with a warning, the next larger first.
+    Without such images, or without a width, the largest ones. If images of that scale are missing,
+    warns and uses the scale with the fewest missing images, preferring the next larger one.
     """
     widths: dict[str, int] = {}
     lost: dict[str, list[str]] = {}

@@ -28,12 +28,12 @@ class NerfstudioSettings(CaptureSettings):
         return (folder / "transforms.json").is_file() and not is_rig(folder)
 
     def load(self, splits: Sequence[str]) -> Scene:
-        """Read a capture and check all of it.
+        """Read and check a whole capture.
 
-        Poses are taken as they stand, but for ``data.orient``: ``applied_transform``,
-        ``applied_scale``, ``scale``, ``offset`` and ``aabb_scale`` say where the world lies in
-        other programs, but the field's frame is estimated from the cameras. Times in any unit are
-        mapped to [0, 1] over all frames, of whichever split.
+        Except for ``data.orient``, poses are used unchanged: ``applied_transform``,
+        ``applied_scale``, ``scale``, ``offset`` and ``aabb_scale`` place the world in other
+        programs, whereas the field's frame is estimated from the cameras. Times in any unit are
+        mapped to [0, 1] over the frames of all splits.
         """
         path = self.folder / "transforms.json"
         if not path.is_file():
@@ -51,7 +51,7 @@ class NerfstudioSettings(CaptureSettings):
 def _listed_splits(
     path: Path, content: Mapping[str, Any], listing: Listing
 ) -> dict[str, list[int]] | None:
-    """Places of the frames that the file lists for each split; None where it lists none."""
+    """Indices of the frames that the file lists for each split; None if it lists no splits."""
     listed = {split: content.get(f"{split}_filenames") for split in SPLITS}
     if all(names is None for names in listed.values()):
         return None
@@ -69,14 +69,14 @@ def _listed_splits(
                 image = image_path(str(path), path.parent.resolve(), name, key)
             except BrokenFrameError:
                 if name in {frame["file_path"] for frame in content["frames"]}:
-                    continue  # There was a warning of it.
+                    continue  # A warning was given when it was left out.
                 raise
             if image not in places:
                 raise SceneError(
-                    f"{path}: {key} names {name}, which no frame shows. Add the frame, or take the "
-                    "name out."
+                    f"{path}: {key} names {name}, which is in no frame. Add the frame, or remove "
+                    "the name."
                 )
-            # Validation and test views may be the same ones.
+            # Validation and test splits may share views.
             other = owner.setdefault(places[image], key)
             if other != key and "train_filenames" in (other, key):
                 raise SceneError(

@@ -1,4 +1,4 @@
-"""Pixels that rays are drawn through: those near silhouettes and far from them."""
+"""Pools of pixels for drawing rays: near silhouettes, far from them, and without texture."""
 
 import copy
 import itertools
@@ -17,31 +17,31 @@ FAR, OTHER, PLAIN, NOTHING = range(4)
 """Kinds of pixels, as numbers."""
 
 ORDER = (FAR, PLAIN, OTHER)
-"""Kinds as they are listed."""
+"""Order of the kinds in the list."""
 
 BLOCK = 2**16
-"""Pixels that 16 bits can number."""
+"""Number of pixels that 16 bits can index."""
 
 PART = 2**22
-"""Pixels whose whole numbers are computed at a time."""
+"""Number of pixels whose full indices are computed at a time."""
 
 CELLS = 8
-"""Pixels of a run, and rows and columns of an image, that are near together."""
+"""Consecutive pixels of a run, or side of a square, that are classified together."""
 
 
 class PixelPools:
-    """Pixels of three kinds, each with a share of its own: far, plain and all others.
+    """Pixels of three kinds, drawn with separate shares: far, plain and all others.
 
-    Pixels are listed kind by kind, by the lower 16 bits of their numbers: whole numbers would take
-    as much memory as the images.
+    Pixels are listed by kind, with the lower 16 bits of their indices: full indices would take as
+    much memory as the images.
 
     Args:
         near: Pixels near silhouettes; all others are far. Overwritten. bool [V, H, W]
-        plain: Pixels whose surroundings have the same colour; None for none. bool [V, H, W]
-        valid: Which pixels show something; None for all. bool [V, H, W]
+        plain: Pixels without texture around them; None for none. bool [V, H, W]
+        valid: Pixels that may be drawn; None for all. bool [V, H, W]
 
     Attributes:
-        sizes: Numbers of far, plain and other pixels; none are plain where no others would be left.
+        sizes: Numbers of far, plain and other pixels; if there were no others, none are plain.
     """
 
     def __init__(
@@ -61,11 +61,11 @@ class PixelPools:
         self.starts = self.counts.cumsum(dim=0) - self.counts
         self.bounds = torch.zeros(2, dtype=torch.float64)
         self.before = F.pad(counts.flatten().cumsum(dim=0), (1, 0))
-        """Listed pixels before those of each kind and block, kind by kind. int64 [3 B + 1]"""
+        """Offset in the list of each kind and block, ordered by kind. int64 [3 B + 1]"""
         self.whole: Tensor | None = None
-        """Numbers of all pixels, on a GPU. [N]"""
+        """Full indices of all pixels, on a GPU. [N]"""
         self.listed = None
-        """Lower bits of all pixels' numbers; None where all are of one kind. int16 [N]"""
+        """Lower bits of all pixels' indices; None if all are of one kind. int16 [N]"""
         if max(self.sizes) < near.numel():
             self.listed = torch.empty(self.total, dtype=torch.int16)
             places = iter(self.listed.split(counts.flatten().tolist()))
@@ -77,10 +77,10 @@ class PixelPools:
         self.bounds = torch.tensor([far, plain], dtype=torch.float64).cumsum(dim=0)
 
     def to(self, device: torch.device) -> "PixelPools":
-        """The same on another device."""
+        """The pools on another device."""
         moved = copy.copy(self)
         if self.listed is not None:
-            # A GPU has room for whole numbers, and a draw there is a few operations shorter.
+            # A GPU has the memory for full indices, which save a few operations per draw.
             kind = torch.int32 if len(self.before) // len(ORDER) * BLOCK < 2**31 else torch.int64
             steps = range(0, self.total, PART)
             parts = (torch.arange(n, min(n + PART, self.total)) for n in steps)
@@ -91,14 +91,14 @@ class PixelPools:
         return moved
 
     def pick(self, kind: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels, and which of them are far, by numbers from 0 to 1. [R] -> bool [R], int64 [R]"""
+        """Whether far, and index of pixels drawn by uniform numbers. [R] -> bool [R], int64 [R]"""
         kind = torch.bucketize(kind.contiguous(), self.bounds, right=True)
         place = torch.addcmul(self.starts[kind], where, self.counts[kind]).long()
         place.clamp_(max=self.total - 1)
         return kind == 0, self.numbers(place)
 
     def numbers(self, place: Tensor) -> Tensor:
-        """Pixels at places in the list. int64 [R] -> int64 [R]"""
+        """Indices of the pixels at positions in the list. int64 [R] -> int64 [R]"""
         if self.whole is not None:
             return self.whole[place].long()
         if self.listed is None:
@@ -109,10 +109,10 @@ class PixelPools:
 
 
 class RunPools:
-    """Pixels of images in files, near silhouettes and far from them, drawn run by run.
+    """Pixels of images in files, near silhouettes and far from them, drawn in runs.
 
-    A run is drawn as often as it has pixels of a kind. `CELLS` consecutive pixels are all near if
-    one of them is, and silhouettes are widened by whole squares of `CELLS` pixels a side.
+    Runs are drawn in proportion to their number of pixels of a kind. `CELLS` consecutive pixels are
+    all near if one is, and silhouettes are dilated by whole squares of side `CELLS`.
 
     Args:
         views: Views whose images are ``images``.
@@ -127,11 +127,11 @@ class RunPools:
         self.views = views
         self.pixels = images.sizes.prod(dim=1)
         self.first = F.pad((-(-self.pixels // RUN)).cumsum(dim=0), (1, 0))
-        """Number of each view's first run, and that of all runs. int64 [V + 1]"""
+        """Index of each view's first run, and number of all runs. int64 [V + 1]"""
         total = int(self.first[-1])
         counts = torch.zeros(2, total, dtype=torch.int64)
         self.near = torch.full((total, RUN // CELLS // 8), 255, dtype=torch.uint8)
-        """A bit for each `CELLS` pixels of a run. uint8 [runs, B]"""
+        """One bit per `CELLS` pixels of a run: whether they are near. uint8 [runs, B]"""
         self.all_near = True
         for index, margin in enumerate(margins):
             runs = slice(int(self.first[index]), int(self.first[index + 1]))
@@ -146,13 +146,13 @@ class RunPools:
             near = cells.repeat_interleave(CELLS, dim=1)
             counts[0, runs], counts[1, runs] = ((valid & (near == kind)).sum(1) for kind in (0, 1))
         self.ends = counts.flatten().cumsum(dim=0)
-        """Pixels up to the end of each run, far ones, then near ones. int64 [2 runs]"""
+        """Cumulative number of pixels per run, far ones, then near ones. int64 [2 runs]"""
         far, near = counts.sum(dim=1).tolist()
         self.sizes = far, 0, near
         self.far_share = 0.0
 
     def _lengths(self, view: Tensor | int, run: Tensor) -> Tensor:
-        """Pixels of runs: the last one of an image may have fewer. [K]"""
+        """Number of pixels per run; the last run of an image may have fewer. [K]"""
         return (self.pixels[view] - RUN * run).clamp(max=RUN)
 
     def share(self, far: float, plain: float) -> None:
@@ -160,7 +160,7 @@ class RunPools:
         self.far_share = far
 
     def pick(self, kind: Tensor, where: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Runs by numbers from 0 to 1: which are far, their views and their numbers there. [K]"""
+        """Runs drawn by uniform numbers: whether far, view, and index within the view. [K] each"""
         far, total, (size, _, rest) = kind < self.far_share, int(self.first[-1]), self.sizes
         place = torch.where(far, where * size, size + where * rest).long()
         place = place.clamp_(max=size + rest - 1)
@@ -169,7 +169,7 @@ class RunPools:
         return far, view, run - self.first[view]
 
     def inside(self, far: Tensor, view: Tensor, run: Tensor, uniform: Tensor) -> Tensor:
-        """Pixels of runs, as `pick` gives these, by numbers from 0 to 1. [K, P] -> int64 [K, P]"""
+        """Pixels drawn within runs of `pick` by uniform numbers. [K, P] -> int64 [K, P]"""
         length = self._lengths(view, run)
         if self.all_near:
             return torch.minimum((uniform * length[:, None]).long(), length[:, None] - 1)
@@ -186,7 +186,7 @@ class RunPools:
 
 
 def _widened(mask: Tensor, margin: int) -> Tensor:
-    """The squares within some pixels of those that hold pixels of a mask. bool [h, w]"""
+    """The squares within ``margin`` pixels of those that contain mask pixels. bool [h, w]"""
     if mask.all():
         return mask
     height, width = mask.shape
@@ -198,5 +198,5 @@ def _widened(mask: Tensor, margin: int) -> Tensor:
 
 
 def _in_runs(mask: Tensor) -> Tensor:
-    """The pixels of an image run by run, False behind the last one. bool [h, w] -> [runs, RUN]"""
+    """The pixels of an image as runs, padded with False. bool [h, w] -> [runs, RUN]"""
     return F.pad(mask.flatten(), (0, -mask.numel() % RUN)).view(-1, RUN)

@@ -1,4 +1,4 @@
-"""Pixels that show something: silhouettes, changes before fixed cameras; and cells shown empty."""
+"""Foreground pixels (silhouettes, or changes in images of fixed cameras), and the visual hull."""
 
 import math
 from collections.abc import Sequence
@@ -11,27 +11,27 @@ from xplanes.scenes.cameras import ball_extent, project
 from xplanes.scenes.views import Views
 
 WINDOW = 0.06
-"""Share of the time span over which content counts as static when silhouettes are intersected."""
+"""Window, as a share of the time span, in which silhouettes are intersected as if static."""
 
 SAME_COLOUR = 4
-"""Steps of 255 by which pixels of one colour differ at most."""
+"""Largest difference, out of 255, between pixels of one colour."""
 
 LEAST_FRAMES = 3
-"""Images that a camera must have taken for their median to show what is static."""
+"""Least number of a camera's images for which their median shows the static content."""
 
 CHANGE = 20
-"""Least difference from the median, of 255 in any channel, of a pixel that has changed."""
+"""Least difference from the median, out of 255 in any channel, of a changed pixel."""
 
 MOST_VIEWS = 5
-"""Most views in such a span: more would cut into moving content and empty little else."""
+"""Most views in the window: more would remove moving content and empty little else."""
 
 
 def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
-    """Pixels of the silhouettes, or within ``margin`` pixels of such. bool [V, H, W]
+    """Pixels within ``margin`` pixels of the silhouettes. bool [V, H, W]
 
     Args:
-        views: Images; none of their padding is foreground.
-        margin: The same for all images, or one for each.
+        views: Images; their padding is never foreground.
+        margin: One for all images, or one for each.
     """
     near = torch.zeros(views.images.shape[:3], dtype=torch.bool)
     margins = [margin] * len(views) if isinstance(margin, int) else margin
@@ -42,11 +42,11 @@ def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
 
 
 def plain(views: Views, margins: Sequence[int]) -> Tensor:
-    """Opaque pixels in surroundings of one colour: walls and floors without texture.
+    """Opaque pixels in a neighbourhood of one colour: walls and floors without texture.
 
     Args:
         views: Images in memory.
-        margins: Size of these surroundings in pixels, for each image. [V]
+        margins: Size of the neighbourhood in pixels, for each image. [V]
 
     Returns:
         bool [V, H, W]
@@ -56,7 +56,7 @@ def plain(views: Views, margins: Sequence[int]) -> Tensor:
         image = views.image(index)
         height, width = image.shape[0] // reach * reach, image.shape[1] // reach * reach
         blocks = image[:height, :width].view(height // reach, reach, width // reach, reach, 4)
-        # Of each block and the eight around it; blocks at the rim have fewer.
+        # Maximum over each block and its eight neighbours.
         most = F.max_pool2d(blocks.amax(dim=(1, 3)).permute(2, 0, 1).float(), 3, 1, 1)
         least = -F.max_pool2d(-blocks.amin(dim=(1, 3)).permute(2, 0, 1).float(), 3, 1, 1)
         even = ((most - least).amax(dim=0) <= SAME_COLOUR) & (least[3] == 255)
@@ -66,14 +66,14 @@ def plain(views: Views, margins: Sequence[int]) -> Tensor:
 
 
 def count_in_squares(mask: Tensor, side: int) -> Tensor:
-    """How many pixels a mask holds in each square of an image.
+    """Number of mask pixels in each square of an image.
 
     Args:
         mask: Pixels. bool [h, w]
         side: Rows and columns of a square.
 
     Returns:
-        Their numbers. int64 [h / side, w / side], rounded up
+        int64 [h / side, w / side], rounded up
     """
     height, width = mask.shape
     padded = F.pad(mask, (0, -width % side, 0, -height % side))
@@ -81,25 +81,25 @@ def count_in_squares(mask: Tensor, side: int) -> Tensor:
 
 
 def widened(mask: Tensor, reach: int) -> Tensor:
-    """Pixels within a square of ``reach`` pixels around those of a mask. bool [H, W]"""
+    """The mask, dilated by ``reach`` pixels with a square. bool [H, W]"""
     side = 2 * reach + 1
-    # Rows, then columns: the square's pixels number many more.
+    # Separable: rows, then columns, is cheaper than the square.
     rows = F.max_pool2d(mask.float()[None], (side, 1), stride=1, padding=(reach, 0))
     return F.max_pool2d(rows, (1, side), stride=1, padding=(0, reach))[0] > 0
 
 
 def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:
-    """Which points may hold something at each view's time, as far as that view alone can tell.
+    """For each view, which points may be occupied at its time, judged by its silhouette alone.
 
-    Points out of a view's sight are not ruled out by it, and images without alpha rule out nothing.
+    Points outside a view's image may be occupied, and so may all points if it has no alpha.
 
     Args:
         views: Images with alpha.
         points: World points. [N, 3]
-        radius: Distance around each point that counts as the point, in world units.
+        radius: Radius around each point that counts as part of it, in world units.
 
     Returns:
-        Whether something may be there. bool [V, N]
+        Whether the point may be occupied. bool [V, N]
     """
     inside = torch.ones(len(views), len(points), dtype=torch.bool)
     intrinsics = views.intrinsics
@@ -115,7 +115,7 @@ def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:
         seen &= margin < math.inf
         if not seen.any():
             continue
-        # The silhouette's pixels in the square around each point, from sums over rectangles.
+        # Silhouette pixels in the square around each point, from a summed-area table.
         sums = F.pad(views.silhouette(index).cumsum(0, dtype=torch.int32).cumsum(1), (1, 0, 1, 0))
         reach = margin[seen].ceil().clamp(max=max(height, width)).long()
         row, column = row[seen].long(), column[seen].long()
@@ -127,18 +127,18 @@ def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:
 
 
 def join_in_time(inside: Tensor, times: Tensor) -> Tensor:
-    """The visual hull over short spans of time, from what each view alone can tell.
+    """The visual hull over short time windows, from the silhouettes of single views.
 
-    A point holds something at a view's time only if every view of some span of time around it
-    allows that. The span is short (`WINDOW`), so that slow motion stays inside the hull; what moves
-    fast can lose its edges. Where all views have one time all must agree, and nothing is lost.
+    A point is occupied at a view's time only if all views of some window around that time allow it.
+    The window is short (`WINDOW`), so that slow motion stays inside the hull; fast content may lose
+    its edges. If all views have the same time, the hull is exact.
 
     Args:
-        inside: Outcome of `may_hold`. bool [V, N]
+        inside: Result of `may_hold`. bool [V, N]
         times: Times of the views. [V]
 
     Returns:
-        For each view's time and point, whether something may be there. bool [V, N]
+        For each view's time and point, whether the point may be occupied. bool [V, N]
     """
     span = max(1, min(MOST_VIEWS, round(WINDOW * len(times))))
     if bool((times == times[0]).all()):
@@ -154,14 +154,14 @@ def join_in_time(inside: Tensor, times: Tensor) -> Tensor:
 
 
 def changing(views: Views, margins: Sequence[int]) -> Tensor | None:
-    """Pixels of fixed cameras that differ from the median over time, or lie near such.
+    """Pixels of fixed cameras near pixels that differ from the median over time.
 
     Args:
         views: Opaque images in memory.
-        margins: Pixels around those that differ, for each image. [V]
+        margins: Margin around those that differ in pixels, for each image. [V]
 
     Returns:
-        None where some camera moves or has few images, or nothing changes. bool [V, H, W]
+        bool [V, H, W]; None if a camera moves or has few images, or nothing changes.
 
     Source: the idea of DyNeRF's importance sampling (Li et al., CVPR 2022, Section 4.3).
     """
@@ -179,7 +179,7 @@ def changing(views: Views, margins: Sequence[int]) -> Tensor | None:
 
 
 def _cameras(views: Views) -> list[list[int]]:
-    """The images of each camera pose with the same intrinsics."""
+    """The images of each camera, identified by pose and intrinsics."""
     intrinsics = views.intrinsics
     numbers = [views.camera_to_world.flatten(1).double(), intrinsics.focal, intrinsics.centre]
     rows = torch.cat([*numbers, intrinsics.size.double()], dim=1)

@@ -22,11 +22,11 @@ SAME = 2
 
 
 HELD_OUT = 8
-"""Where a scene has no validation split, one in this number of training views is held out."""
+"""One in this many training views is held out if a scene has no validation split."""
 
 
 def may_hold_out(train: Views) -> bool:
-    """Whether there are training views enough to hold some out."""
+    """Whether there are enough training views to hold some out."""
     return len(train) >= 2 * HELD_OUT
 
 
@@ -41,7 +41,7 @@ def frames_are_equal(video: Views) -> bool:
 
 
 def as_static(scene: Scene, reason: str) -> Scene:
-    """The scene as a static one: all views at time 0, and one frame of its video.
+    """The scene, made static: all views at time 0, and one frame of its video.
 
     Args:
         scene: The scene.
@@ -78,10 +78,10 @@ class SceneSettings(Settings, ABC):
     cache: Location | None  # Folder for images too large for memory; null: the user's cache.
 
     files: ClassVar[str] = ""
-    """What a folder of this format holds, for messages; empty for formats without folders."""
+    """Content of a folder of this format, for messages; empty for formats without folders."""
 
     hint: ClassVar[str] = ""
-    """What else to do where there is none."""
+    """Further advice if there is no such scene."""
 
     @property
     def folder(self) -> Path:
@@ -89,7 +89,7 @@ class SceneSettings(Settings, ABC):
         return Path(self.root) / self.scene
 
     def no_scene(self) -> SceneError:
-        """The error for a folder that holds no scene of this format; names those that do."""
+        """The error for a folder without a scene of this format; names nearby scenes."""
         folder = self.folder.absolute()
         there = "is not a folder" if folder.exists() else "does not exist"
         there = f"holds no {self.files}" if folder.is_dir() else there
@@ -104,7 +104,7 @@ class SceneSettings(Settings, ABC):
 
     @classmethod
     def _is_scene(cls, path: Path) -> bool:
-        with suppress(OSError):  # Some folders are closed to the user.
+        with suppress(OSError):  # The user may not have access to some folders.
             return path.is_dir() and cls.recognises(path)
         return False
 
@@ -117,7 +117,7 @@ class SceneSettings(Settings, ABC):
     def recognises(cls, folder: Path) -> bool:
         """Whether a folder looks like a scene of this format, judged by its file names.
 
-        False for formats that read no folders of the user.
+        False for formats that do not read the user's folders.
         """
         return False
 
@@ -141,13 +141,13 @@ class SceneSettings(Settings, ABC):
         """
 
     def thinned(self, parts: Mapping[str, Part]) -> dict[str, Part]:
-        """Splits with as many views as `views` and `eval_views` ask for.
+        """Splits, reduced to the numbers of views in `views` and `eval_views`.
 
         Args:
             parts: Views, or lists of images, by split name.
 
         Raises:
-            SceneError: If the train split has fewer.
+            SceneError: If the train split has fewer views.
         """
         found = {}
         for split, part in parts.items():
@@ -170,9 +170,9 @@ class SceneSettings(Settings, ABC):
 
         Args:
             parts: The images of each split.
-            mask_use: What the black parts of masks are.
+            mask_use: Meaning of the black parts of masks.
             whole: All images of the capture, see `read_splits`.
-            up: Which way is up; empty where the world is that of the files.
+            up: Description of the up direction; empty if the files' world is unchanged.
             **more: Further attributes of the scene.
 
         Raises:
@@ -184,7 +184,7 @@ class SceneSettings(Settings, ABC):
             poses = torch.cat([listing.camera_to_world for listing in parts.values()])
             up = world_turn(poses, (), False)[1]
             if world_turn(poses, (), None)[0] is not None:
-                warn(f"{self.folder}: up is {up}. If the scene lies on its side, turn the poses.")
+                warn(f"{self.folder}: up is {up}. If the scene lies on its side, rotate the poses.")
         notes = {**notes, "up": up}
         return Scene(self.folder.resolve().name, splits, cut=cut, notes=notes, **more)
 
@@ -229,28 +229,28 @@ class SceneSettings(Settings, ABC):
             if may_hold_out(train):
                 return scene
             warn(
-                f"{self.folder}: {len(train)} images are too few to hold some out: the images that "
-                "are trained on are scored, which says little of other views."
+                f"{self.folder}: {len(train)} images are too few to hold some out: the training "
+                "images are scored, which says little about other views."
             )
             return replace(scene, splits={**scene.splits, "val": train})
 
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureSettings(SceneSettings, ABC):
-    """Base class of formats that hold images out and have masks."""
+    """Base class of formats with held-out images and masks."""
 
-    # Where the capture lists no splits: hold out every n-th image as val, in order of time and file
+    # If the capture lists no splits, every n-th image is held out as val, in order of time and file
     # name; never the first or last.
     eval_every: Count
-    # What masks leave out. alpha: is empty; ignore: is neither trained on nor scored; auto: alpha
-    # where they look like silhouettes, else ignore; lrm: is removed from the LRM's input alone.
+    # Use of masked-out pixels. alpha: empty space; ignore: neither trained on nor scored; auto:
+    # alpha if masks look like silhouettes, else ignore; lrm: only the LRM's input is masked.
     mask_use: MaskUse
     # Rotate the world so that the cameras' mean up vector becomes its z axis. null: if that is more
     # than 60 degrees from it.
     orient: bool | None
 
     more_splits: ClassVar[str] = ""
-    """What else makes a split, for messages."""
+    """Further ways to define a split, for messages."""
 
     def capture(
         self,
@@ -260,13 +260,13 @@ class CaptureSettings(SceneSettings, ABC):
         source: Path,
         points: np.ndarray | None = None,
     ) -> Scene:
-        """The splits asked for of a whole capture.
+        """The requested splits of a capture.
 
         Args:
             listing: All images.
-            places: Those of each split, by their places in the list.
+            places: Indices of each split's images in the list.
             splits: Names of splits.
-            source: What the splits were made from, for messages.
+            source: Source of the splits, for messages.
             points: World points on surfaces. [N, 3]
 
         Raises:

@@ -1,12 +1,12 @@
 """Decoded images that need not fit in memory: a file of pixels, written once and read in pieces.
 
-A file holds the pixels of all images one after the other, each image's row by row; behind them, for
-images with alpha, a bit for each pixel that says whether the silhouette holds it. Its name is a
-hash of the sources and of how they were decoded, so it needs no header: a file of that name and of
-the right length is the right one. Its modification time is when it was used last.
+A file contains the pixels of all images in order, row by row. For images with alpha, one bit per
+pixel follows at the end: whether the pixel belongs to the silhouette. The file's name is a hash of
+the sources and of the decoding, so that it needs no header: a file with that name and the right
+length is valid. Its modification time is that of its last use.
 
-Pixels are read, not mapped: the pages of a mapping count as the process's own memory, and a mapped
-file that somebody truncates kills the process.
+Pixels are read rather than memory-mapped: pages of a mapping count as memory of the process, and
+truncating a mapped file kills the process.
 """
 
 import hashlib
@@ -43,25 +43,25 @@ Size = tuple[int, int]
 """Height and width."""
 
 IN_MEMORY = 2**30
-"""Bytes up to which the decoded images of a split are held in memory."""
+"""Largest size in bytes of a split's decoded images in memory."""
 
 RUN = 4096
 """Consecutive pixels of an image that are read together: 12 kB without alpha, 16 kB with it."""
 
 VERSION = 4
-"""Version of the files; increase it whenever images are decoded to other bytes."""
+"""Version of the files; increase it whenever decoding gives different bytes."""
 
 SPARE = 2**28
-"""Bytes of the disk that are left free."""
+"""Bytes to leave free on the disk."""
 
 UNUSED_DAYS = 30
-"""Days after which a file of the user's cache that no run has used is removed."""
+"""Days without use after which a file in the user's cache is removed."""
 
 NAME = re.compile(r"[0-9a-f]{32}\.(pixels|tiles)")
-"""Names of the files, those of earlier versions included."""
+"""Pattern of the files' names, including those of earlier versions."""
 
 Job = Callable[[], Iterable[tuple[int, np.ndarray]]]
-"""Decodes some of the images: gives their numbers and pixels, uint8 [h, w, 3 or 4]."""
+"""Decodes some of the images: yields their indices and pixels, uint8 [h, w, 3 or 4]."""
 
 
 class PixelFile:
@@ -69,7 +69,7 @@ class PixelFile:
 
     Args:
         source: The file, or its bytes. uint8 [N]
-        key: Hash of what the images come from.
+        key: Hash of the images' sources.
         sizes: Height and width of each image.
         channels: 3 for images without alpha, else 4.
     """
@@ -87,7 +87,7 @@ class PixelFile:
 
     @classmethod
     def of(cls, images: Iterable[Tensor]) -> "PixelFile":
-        """The same in memory, of images with alpha. uint8 [h, w, 4] each"""
+        """Build in memory from images with alpha. uint8 [h, w, 4] each"""
         arrays = [image.numpy() for image in images]
         sizes = [(array.shape[0], array.shape[1]) for array in arrays]
         first, content = _firsts(sizes), np.zeros(_length(sizes, 4), np.uint8)
@@ -119,7 +119,7 @@ class PixelFile:
         return content.reshape(-1, self.channels)
 
     def prefetch(self, index: int, start: int, count: int) -> None:
-        """Ask the system to read pixels ahead, where it can be asked."""
+        """Ask the operating system to read pixels ahead, if it supports that."""
         if self._file is not None and hasattr(os, "posix_fadvise"):
             span = (self.first[index] + start) * self.channels, count * self.channels
             os.posix_fadvise(self._file.fileno(), *span, os.POSIX_FADV_WILLNEED)
@@ -133,8 +133,8 @@ class PixelFile:
             content = self._file.read(length)
         if len(content) < length:
             raise StorageError(
-                f"{self.source} ends too early: it was cut off while in use. Delete it and start "
-                "again; it is decoded again"
+                f"{self.source} ends too early: it was truncated while in use. Delete it and start "
+                "again; then the images are decoded again"
             )
         return np.frombuffer(content, np.uint8)
 
@@ -143,7 +143,7 @@ class StoredImages:
     """The images of some views, in files of pixels. Read-only.
 
     Args:
-        places: The file of each view, and the number of its image there. [V]
+        places: The file of each view, and the index of its image there. [V]
     """
 
     def __init__(self, places: Iterable[tuple[PixelFile, int]]) -> None:
@@ -159,7 +159,7 @@ class StoredImages:
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """That of the images as one tensor: their number, largest height and width, 4."""
+        """Shape of the images as one tensor: their number, largest height and width, 4."""
         height, width = self.sizes.amax(dim=0).tolist() if self.places else (0, 0)
         return len(self.places), height, width, 4
 
@@ -171,7 +171,7 @@ class StoredImages:
 
     @property
     def identity(self) -> list[Any]:
-        """What distinguishes these images from others, as builtins."""
+        """Key that identifies these images, as builtins."""
         return [[file.key, image] for file, image in self.places]
 
     def image(self, index: int) -> Tensor:
@@ -189,8 +189,8 @@ class StoredImages:
 
         Args:
             views: The view of each run. int64 [K]
-            runs: Numbers of the runs in their images. int64 [K]
-            inside: Numbers of the pixels in their runs. int64 [K, P]
+            runs: Indices of the runs in their images. int64 [K]
+            inside: Indices of the pixels in their runs. int64 [K, P]
 
         Returns:
             Premultiplied colour and alpha. uint8 [K, P, 4]
@@ -203,7 +203,7 @@ class StoredImages:
         return torch.from_numpy(found)
 
     def prefetch(self, views: Tensor, runs: Tensor) -> None:
-        """Ask the system to read some runs ahead. int64 [K], int64 [K]"""
+        """Ask the operating system to read some runs ahead. int64 [K], int64 [K]"""
         for view, run in zip(views.tolist(), runs.tolist(), strict=True):
             file, image = self.places[view]
             file.prefetch(image, run * RUN, RUN)
@@ -213,7 +213,7 @@ class StoredImages:
         return StoredImages(self.places[index] for index in indices.tolist())
 
     def joined(self, other: "StoredImages") -> "StoredImages":
-        """These, then the others."""
+        """These images, then the others."""
         return StoredImages(self.places + other.places)
 
 
@@ -221,7 +221,7 @@ def default_cache() -> Path:
     """The folder of decoded images in the user's cache directory."""
     try:
         home = Path.home()
-    except RuntimeError:  # The user has none, as in containers: no folder can be made in a file.
+    except RuntimeError:  # No home directory, as in containers; the path below cannot be created.
         home = Path(os.devnull)
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local"
@@ -242,20 +242,20 @@ def images(
 ) -> "Tensor | StoredImages":
     """Decode images to memory, or to a file of the cache if they take more than `IN_MEMORY` bytes.
 
-    Of several processes that need the same images one decodes and the others wait. What a killed
-    process left behind is removed by the next one. Before the user's cache takes a new file, those
-    that were not used for `UNUSED_DAYS` are removed from it.
+    If several processes need the same images, one decodes them and the others wait. Leftovers of a
+    killed process are removed by the next one. Before a new file is added to the user's cache,
+    files that were not used for `UNUSED_DAYS` are removed from it.
 
     Args:
         sizes: Height and width of each image. [V]
-        jobs: Decode the images, each some of them. They run in threads.
-        sources: Files that the images come from; the result belongs to their sizes and times.
-        recipe: How they are decoded, as builtins.
+        jobs: Each decodes some of the images, in a thread.
+        sources: Files of the images; their sizes and modification times are part of the key.
+        recipe: Parameters of the decoding, as builtins.
         has_alpha: Whether any image has alpha.
-        folder: The cache; that of the user when None.
+        folder: The cache; the user's when None.
 
     Raises:
-        StorageError: If the disk lacks the space, or cannot be written.
+        StorageError: If the disk is full or cannot be written.
     """
     height, width = _largest(sizes)
     if 4 * len(sizes) * height * width <= IN_MEMORY:
@@ -268,7 +268,7 @@ def in_memory(sizes: Sequence[Size], jobs: Sequence[Job]) -> Tensor:
 
     Args:
         sizes: Height and width of each image. [V]
-        jobs: Decode the images, each some of them. They run in threads.
+        jobs: Each decodes some of the images, in a thread.
 
     Returns:
         Premultiplied colour and alpha. uint8 [V, H, W, 4]
@@ -292,7 +292,7 @@ def _decoded(
     channels: int,
     folder: Path | None,
 ) -> StoredImages:
-    """The images in a file of the cache, decoded unless it is there already."""
+    """The images in a file of the cache, decoded unless the file exists."""
     is_default = folder is None
     folder = default_cache() if folder is None else folder
     states = [(str(path.resolve()), path.stat()) for path in sources]
@@ -306,7 +306,7 @@ def _decoded(
         try:
             if path.stat().st_size != length:
                 return None
-            with suppress(OSError):  # The cache may be another user's, or on a read-only disk.
+            with suppress(OSError):  # The cache may belong to another user, or be read-only.
                 os.utime(path)
             return StoredImages.all_of(PixelFile(path, key, sizes, channels))
         except (FileNotFoundError, NotADirectoryError, PermissionError):
@@ -321,7 +321,7 @@ def _decoded(
     with in_turn(path.with_suffix(".lock")):
         if (ready := stored()) is not None:
             return ready
-        # Whoever holds the lock owns what others left unfinished under this name.
+        # The lock's owner may remove unfinished files of this name.
         for leftover in folder.glob(f".{path.name}{MARK}*"):
             leftover.unlink(missing_ok=True)
         if is_default:
@@ -349,11 +349,11 @@ def _decoded(
 
 
 def _remove_unused(folder: Path) -> None:
-    """Remove files that were not used for long, and what killed writers left behind."""
+    """Remove files that were not used for long, and unfinished files of killed processes."""
     clear_unfinished(folder, older_than=DAY)
     oldest, freed = time.time() - UNUSED_DAYS * DAY, 0
     for path in folder.iterdir():
-        # Windows does not remove what is open; elsewhere readers keep what they have opened.
+        # Windows does not remove open files; elsewhere readers keep their open files.
         with suppress(OSError):
             if not NAME.fullmatch(path.name) or path.stat().st_mtime > oldest:
                 continue
@@ -370,7 +370,7 @@ def _remove_unused(folder: Path) -> None:
 
 
 def _write(path: Path, sizes: Sequence[Size], channels: int, jobs: Sequence[Job]) -> None:
-    """Decode all images to a file, with one image of each thread in memory."""
+    """Decode all images to a file, with one image per thread in memory."""
     from tqdm import tqdm
 
     first, turn, done = _firsts(sizes), threading.Lock(), []
@@ -392,7 +392,7 @@ def _write(path: Path, sizes: Sequence[Size], channels: int, jobs: Sequence[Job]
                 content = part.data
                 with turn:
                     file.seek(offset)
-                    # A write may take less than it is given, at most 2 GB on Linux.
+                    # One call may write only a part, at most 2 GB on Linux.
                     while len(content):
                         content = content[file.write(content) :]
             done.append(index)
@@ -403,7 +403,7 @@ def _write(path: Path, sizes: Sequence[Size], channels: int, jobs: Sequence[Job]
 
 
 def _run(jobs: Sequence[Job], keep: Callable[[int, np.ndarray], None]) -> None:
-    """Run jobs in threads, until one fails; each image is handed on as it is decoded."""
+    """Run jobs in threads until one fails; each decoded image is passed to ``keep``."""
     stop = threading.Event()
 
     def run(job: Job) -> None:
@@ -413,10 +413,10 @@ def _run(jobs: Sequence[Job], keep: Callable[[int, np.ndarray], None]) -> None:
                     return
                 keep(index, pixels)
         except BaseException:
-            stop.set()  # Other jobs may be long.
+            stop.set()  # Ends other jobs early.
             raise
 
-    # Decoders work without the interpreter lock, so threads are enough.
+    # Decoders release the interpreter lock, so that threads suffice.
     pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1, len(jobs)))
     try:
         list(pool.map(run, jobs))
@@ -426,7 +426,7 @@ def _run(jobs: Sequence[Job], keep: Callable[[int, np.ndarray], None]) -> None:
 
 
 def _with_channels(pixels: np.ndarray, channels: int) -> np.ndarray:
-    """Pixels with 3 or 4 channels: alpha is dropped, or 255. uint8 [h, w, C]"""
+    """Pixels with 3 or 4 channels: alpha is dropped, or added as 255. uint8 [h, w, C]"""
     if pixels.shape[-1] >= channels:
         return pixels[..., :channels]
     return np.pad(pixels, ((0, 0), (0, 0), (0, 1)), constant_values=255)
@@ -444,12 +444,12 @@ def _parts(
 
 
 def _bits(first: Sequence[int], index: int) -> int:
-    """Offset of the bits of image ``index``; a byte more each makes room for incomplete ones."""
+    """Offset of the bits of image ``index``; an extra byte per image allows for incomplete ones."""
     return first[-1] * 4 + first[index] // 8 + index
 
 
 def _length(sizes: Sequence[Size], channels: int) -> int:
-    """Bytes of a file."""
+    """Length of a file in bytes."""
     first = _firsts(sizes)
     return _bits(first, len(sizes)) if channels == 4 else first[-1] * channels
 
@@ -460,5 +460,5 @@ def _largest(sizes: Sequence[Size]) -> Size:
 
 
 def _firsts(sizes: Sequence[Size]) -> list[int]:
-    """Number of the first pixel of each image, and that of all pixels."""
+    """Index of each image's first pixel, and the number of all pixels."""
     return [0, *np.cumsum([height * width for height, width in sizes]).tolist()]

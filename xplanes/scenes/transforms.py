@@ -1,4 +1,4 @@
-"""Files of cameras and times (transforms_train.json and its kin), read and checked."""
+"""Reading and checking of transforms files: cameras and times as in transforms_train.json."""
 
 import logging
 import math
@@ -35,13 +35,13 @@ FISHEYES = (
     "THIN_PRISM_FISHEYE",
 )
 OTHER_MODELS = ("FISHEYE", "EQUIRECTANGULAR", "ORTHO", "OMNI", "VR180", "DIVISION", "EUCM")
-"""Parts of the names of lens models that are not read, but for those above."""
+"""Parts of names of unsupported lens models; those above take precedence."""
 
 OTHER_AXES = ("from_mitsuba", "normal_mts_args", "from_na")
-"""Keys with which instant-ngp and NeuS2 mark poses whose axes are not OpenGL's."""
+"""Keys of instant-ngp and NeuS2 for poses with axes other than OpenGL's."""
 
 OTHER_LENSES = ("equirectangular", "latlong", "orthographic", "ftheta_p0")
-"""Keys of further lenses in files of instant-ngp."""
+"""Keys of unsupported lenses in files of instant-ngp."""
 
 NUMBERS = (
     *PIXELS,
@@ -49,13 +49,13 @@ NUMBERS = (
     *("sx1", "sy1", "omega", "camera_angle_x", "camera_angle_y", "time", "timestamp"),
     *("x_fov", "y_fov", "fovx", "fovy"),
 )
-"""Keys whose values are numbers, which some programs write as text."""
+"""Keys with numbers, which some programs write as strings."""
 
 DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""Order of the list of coefficients that nerfstudio writes and reads."""
+"""Order of nerfstudio's list of distortion coefficients."""
 
 SQUARE = 0.01
-"""Difference of focal lengths along x and y above which pixels are not square."""
+"""Relative difference of focal lengths along x and y above which pixels are not square."""
 
 MATRICES = ("intrinsic_matrix", "intrinsics", "K")
 """Keys of intrinsic matrices, of 3 rows and columns or more."""
@@ -79,26 +79,26 @@ IGNORED = (
     *("normal_file_path", "depth_unit_scale_factor", "rotation", "render_aabb", "path"),
     *("crop_width", "crop_height", "blur_score", "n_images", "fps"),
 )
-"""Keys of other programs that change nothing here."""
+"""Keys of other programs without effect here."""
 
 BESIDE = {
     "ignored": ["dynamic_mask_{stem}.png"],
     "alpha": ["{stem}.alpha{suffix}", "{stem}{suffix}.alpha{suffix}"],
 }
-"""Names of mask files beside an image, by what they mean."""
+"""Names of mask files beside an image, by their meaning."""
 
 TRANSPARENT = {"white_transparent": 255, "black_transparent": 0}
-"""Keys with which instant-ngp marks a colour as transparent, and its channels' value."""
+"""Keys of instant-ngp that declare a grey level transparent, with this level."""
 
 SYNONYMS = {"sx1": "s1", "sy1": "s3"}
-"""What COLMAP calls the prism coefficients of a fisheye lens."""
+"""COLMAP's names of a fisheye lens's prism coefficients."""
 
 
 def read_transforms(path: Path) -> Listing:
     """Read and check a transforms file of the D-NeRF or Blender format.
 
     Raises:
-        SceneError: Anything is missing, out of range, repeated, or outside the scene's folder.
+        SceneError: If anything is missing, out of range, repeated, or outside the scene's folder.
     """
     return listing_of(path, read_frames(path))
 
@@ -108,12 +108,12 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
 
     Args:
         path: The file.
-        content: What `read_frames` read from it.
-        any_unit: Whether times may be in any unit and called "timestamp"; they are mapped to
-            [0, 1] then, unless they are a "time" in that range.
+        content: Result of `read_frames`.
+        any_unit: Whether times may be in any unit and have the key "timestamp"; they are then
+            mapped to [0, 1], unless the key is "time" and they are in that range.
 
     Raises:
-        SceneError: Anything is missing, out of range, repeated, or outside the scene's folder.
+        SceneError: If anything is missing, out of range, repeated, or outside the scene's folder.
     """
     folder = path.parent.resolve()
     frames = _usable(path, content, folder)
@@ -140,7 +140,7 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
 
 
 class _Frame(NamedTuple):
-    """A frame that can be used: its label for messages, its entry, and what this refers to."""
+    """A usable frame: its label for messages, its entry, and the content of the entry."""
 
     label: str
     entry: dict[str, Any]
@@ -150,7 +150,7 @@ class _Frame(NamedTuple):
 
 
 def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame]:
-    """Frames that can be used; a warning lists those without an image or with an infinite pose."""
+    """Usable frames; warns about those without an image or with an infinite pose."""
 
     def read(item: tuple[int, dict[str, Any]]) -> _Frame:
         index, entry = item
@@ -165,7 +165,7 @@ def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame
 
 
 def _masks_beside(paths: Sequence[Path]) -> tuple[list[Path | None], str]:
-    """Masks beside images, by the names that instant-ngp gives them, and what they mean."""
+    """Masks beside images, with instant-ngp's names, and their meaning."""
     for meaning, patterns in BESIDE.items():
         names = [[p.format(stem=path.stem, suffix=path.suffix) for p in patterns] for path in paths]
         found = [
@@ -180,7 +180,7 @@ def _masks_beside(paths: Sequence[Path]) -> tuple[list[Path | None], str]:
 def _calibrations(
     path: Path, content: Mapping[str, Any], frames: Sequence[_Frame]
 ) -> tuple[Calibration, ...]:
-    """The cameras of all frames, with a warning of pixels that are not square. [V]"""
+    """The cameras of all frames; warns about pixels that are not square. [V]"""
     stated = [read_calibration(str(path), content, frame.label, frame.entry) for frame in frames]
     found = tuple(
         _with_height(camera, {**content, **frame.entry}, frame.image)
@@ -189,7 +189,7 @@ def _calibrations(
     if stretched := sum(new != old for new, old in zip(found, stated, strict=True)):
         warn(
             f"{path}: camera_angle_y of {stretched} of {len(found)} frames gives pixels that are "
-            "not square, and is followed. If they are square, take it out: Blender's own angle_y "
+            "not square, and is used. If they are square, remove it: Blender's own angle_y "
             "belongs to the sensor, not to the image."
         )
     _warn_of_two_focal_lengths(path, content, frames, found)
@@ -202,9 +202,9 @@ def _warn_of_two_focal_lengths(
     frames: Sequence[_Frame],
     cameras: Sequence[Calibration],
 ) -> None:
-    """Warn of fields of view that disagree with focal lengths in pixels, which are followed."""
+    """Warn if fields of view contradict focal lengths in pixels, which take precedence."""
     for frame, camera in zip(frames, cameras, strict=True):
-        # That along y is often the sensor's, which is higher than a landscape image.
+        # The angle along y is often that of the sensor, which is higher than a landscape image.
         for axis, side in (("x", camera.w), ("y", camera.h)):
             keys = frame.entry if f"fl_{axis}" in frame.entry else content
             angle, focal = keys.get(f"camera_angle_{axis}"), getattr(camera, f"fl_{axis}")
@@ -214,16 +214,16 @@ def _warn_of_two_focal_lengths(
             counts = axis == "x" or side > (camera.w or math.inf)
             if counts and abs(other / focal - 1) > SQUARE and f"fl_{axis}" in keys:
                 warn(
-                    f"{frame.label}: fl_{axis}={focal:g} is followed, but camera_angle_{axis} "
-                    f"means {other:.4g} pixels. Compare both with the camera: BlenderNeRF takes "
-                    "the wrong side of the sensor for fl_x and fl_y of images that are higher than "
-                    "wide. Take the wrong keys out."
+                    f"{frame.label}: fl_{axis}={focal:g} is used, but camera_angle_{axis} "
+                    f"means {other:.4g} pixels. Compare both with the camera: BlenderNeRF computes "
+                    "fl_x and fl_y of portrait images from the wrong side of the sensor. Remove "
+                    "the wrong keys."
                 )
                 return
 
 
 def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> Calibration:
-    """A camera, with pixels that are not square if its two fields of view imply that."""
+    """The camera, with non-square pixels if its two fields of view imply them."""
     angle = keys.get("camera_angle_y")
     if camera.fl_y is not None or not is_positive(angle) or angle >= math.pi:
         return camera
@@ -232,7 +232,7 @@ def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> C
     down = focal_length(angle, height)
     if abs(down / across - 1) < SQUARE:
         return camera
-    # In pixels of the size that principal points are in.
+    # In the pixel size to which principal points refer.
     wide = camera.w or width * (camera.h or height) / height
     high = camera.h or height * wide / width
     sides = {"fl_x": across * wide / width, "fl_y": down * high / height, "w": wide, "h": high}
@@ -240,31 +240,31 @@ def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> C
 
 
 def _warn_of_unknown(path: Path, content: Mapping[str, Any]) -> None:
-    """Warn of keys that are not read and may change what images or cameras mean."""
+    """Warn about unknown keys, which may affect images or cameras."""
     entries = (content, *content["frames"])
     given = {
         key
         for each in entries
         for key, value in each.items()
-        if _says_something(value) or "color" in key  # Black is a colour.
+        if _has_content(value) or "color" in key  # Zeros in a colour mean black.
     }
     if unknown := sorted(given - {*KNOWN, *IGNORED}):
         warn(
-            f"{path}: keys that are not read are {', '.join(map(short, unknown))}. Where one of "
-            "them changes what the images or cameras mean, convert these and take the key out."
+            f"{path}: keys that are not read are {', '.join(map(short, unknown))}. If one of them "
+            "affects the images or cameras, convert these and remove the key."
         )
 
 
-def _says_something(value: Any) -> bool:
-    """Whether a value is more than null, false, zeros or empty."""
-    return any(map(_says_something, value)) if isinstance(value, list) else bool(value)
+def _has_content(value: Any) -> bool:
+    """Whether a value is not null, false, zero or empty, nor a list of such."""
+    return any(map(_has_content, value)) if isinstance(value, list) else bool(value)
 
 
 def _plain(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
-    """The keys with numbers that are written as text, and intrinsics as the other keys have them.
+    """The keys in standard form: strings as numbers, and alternative intrinsics by standard keys.
 
-    Fields of view are in radians then; instant-ngp's x_fov, which counts more than focal lengths,
-    and its converter's fovx are in degrees.
+    Fields of view are converted to radians. instant-ngp's x_fov, which takes precedence over focal
+    lengths, and its converter's fovx are in degrees.
     """
     found = dict(keys)
     for key in {*NUMBERS} & {*keys}:
@@ -274,7 +274,7 @@ def _plain(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
         with suppress(TypeError, ValueError, LookupError):
             (fl_x, _, cx), (_, fl_y, cy) = keys[key][0][:3], keys[key][1][:3]
             found = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy} | found
-            del found[key]  # Others are warned of.
+            del found[key]  # Other values get the warning about unknown keys.
     for axis in "xy":
         angle, name = found.get(f"{axis}_fov"), f"camera_angle_{axis}"
         if is_positive(angle):
@@ -304,7 +304,7 @@ def read_frames(path: Path) -> dict[str, Any]:
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise SceneError(f"{path}: frame {index} is {short(frame)}, not an object with keys.")
-        if "transform_matrix_start" in frame:  # Of a camera that moves while it exposes.
+        if "transform_matrix_start" in frame:  # The camera moves during exposure.
             frame.setdefault("transform_matrix", frame["transform_matrix_start"])
         frame.setdefault("transform_matrix", None)
         if "file_path" not in frame:
@@ -316,14 +316,14 @@ def read_frames(path: Path) -> dict[str, Any]:
         if content.get(key):
             raise SceneError(
                 f"{path}: {key}={short(content[key])} stands for poses with other axes than "
-                "OpenGL's (x right, y up, z backward). Convert transform_matrix, and take the key "
-                "out."
+                "OpenGL's (x right, y up, z backward). Convert transform_matrix, and remove the "
+                "key."
             )
     return _plain(path, content) | {"frames": [_plain(path, each) for each in frames]}
 
 
 def _times(path: Path, frames: Sequence[_Frame], any_unit: bool) -> tuple[list[float], str]:
-    """Times of all frames, and where they come from; empty where no frame has one."""
+    """Times of all frames, and their source; empty if no frame has a time."""
     stamped = any_unit and not any("time" in frame.entry for frame in frames)
     key = "timestamp" if stamped else "time"
     bare = [frame.label for frame in frames if key not in frame.entry]
@@ -355,21 +355,21 @@ def _times(path: Path, frames: Sequence[_Frame], any_unit: bool) -> tuple[list[f
 def read_calibration(
     where: str, content: Mapping[str, Any], label: str, frame: Mapping[str, Any]
 ) -> Calibration:
-    """The camera of a frame: its own keys, those of the file where it has none.
+    """The camera of a frame: from its own keys, else from those of the file.
 
     Args:
         where: The file, for messages.
-        content: What it holds.
+        content: Content of the file.
         label: The file and frame, for messages.
-        frame: What the frame holds.
+        frame: Content of the frame.
 
     Raises:
-        SceneError: If a key is missing or out of range, or the lens is one that is not read.
+        SceneError: If a key is missing or out of range, or the lens is not supported.
     """
     shared, own = _pixels(where, content), _pixels(label, frame)
     name, keys = where, content
     if "camera_angle_x" in frame and "fl_x" not in own:
-        # Focal lengths of the file are not those of this frame.
+        # The frame's field of view replaces the file's focal lengths.
         shared = {key: value for key, value in shared.items() if key not in ("fl_x", "fl_y")}
         name, keys = label, frame
     known = shared | own
@@ -396,9 +396,9 @@ def read_calibration(
 
 
 def _pixels(name: str, keys: Mapping[str, Any]) -> dict[str, float]:
-    """The keys in pixels that are given; null is none, and so is 0 for sizes."""
+    """The given keys in pixels; null counts as missing, and so does 0 for sizes."""
     if all(keys.get(key) is None for key in PIXELS[:4]):
-        # A size alone means nothing, so it is not checked.
+        # Sizes without a focal length have no effect, so they are not checked.
         return {key: keys[key] for key in ("w", "h") if is_positive(keys.get(key))}
     found = {}
     for key in PIXELS:
@@ -418,7 +418,7 @@ def _pixels(name: str, keys: Mapping[str, Any]) -> dict[str, float]:
 def _lens(
     where: str, content: Mapping[str, Any], label: str, frame: Mapping[str, Any]
 ) -> tuple[LensModel, tuple[float, ...]]:
-    """The kind of lens of a frame, and its distortion; none where it has none."""
+    """The kind of lens of a frame, and its distortion; empty if it has none."""
     model, name, found = LensModel.PERSPECTIVE, "", {}
     for source, keys in ((where, content), (label, frame)):
         for key in OTHER_LENSES:
@@ -459,7 +459,7 @@ def _lens(
 
 
 def _listed_distortion(source: str, keys: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The keys with nerfstudio's list of coefficients taken apart; single ones count more."""
+    """The keys with nerfstudio's list of coefficients split; single keys take precedence."""
     listed = keys.get("distortion_params")
     if listed is None:
         return keys
@@ -473,7 +473,7 @@ def _listed_distortion(source: str, keys: Mapping[str, Any]) -> Mapping[str, Any
 
 
 def _model(source: str, name: str) -> LensModel:
-    """The kind of lens that a name means; unknown names are perspective cameras."""
+    """The kind of lens for a name; unknown names count as perspective cameras."""
     if name in FISHEYES:
         return LensModel.FISHEYE
     if any(word in name for word in OTHER_MODELS):

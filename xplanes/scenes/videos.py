@@ -14,7 +14,7 @@ from xplanes.optional import require
 from xplanes.scenes.images import Size
 
 SUFFIXES = """.mp4 .mov .m4v .mkv .webm .avi .mpg .mpeg .ts .mts .m2ts .3gp .wmv""".split()
-"""Suffixes of files that are taken for videos."""
+"""Suffixes of video files."""
 
 
 HDR = {16: "PQ", 18: "HLG"}
@@ -28,9 +28,9 @@ class Video:
     Attributes:
         path: The file.
         size: Height and width of its frames.
-        count: Number of the frames that it shows.
+        count: Number of frames that are shown.
         rate: Frames per second; None if unknown.
-        times: When they are shown, in seconds; empty if unknown.
+        times: Presentation times of the frames in seconds; empty if unknown.
     """
 
     path: Path
@@ -44,14 +44,14 @@ def read_header(path: Path) -> Video:
     """Size, number, rate and times of a video's frames. Nothing is decoded.
 
     Raises:
-        SceneError: If the file is no video.
+        SceneError: If the file is not a video.
         MissingExtraError: If PyAV is not installed.
     """
     av = require("av", extra="video")
     try:
         with av.open(str(path)) as container:
             stream = _stream(path, container)
-            # Not of those that an edit list hides, which containers count, too.
+            # Without frames hidden by an edit list, which the container's count includes.
             stamps = [
                 packet.pts
                 for packet in container.demux(stream)
@@ -62,8 +62,8 @@ def read_header(path: Path) -> Video:
             times = tuple(float(stamp * stream.time_base) for stamp in known) if whole else ()
             if (curve := stream.codec_context.color_trc) in HDR:
                 warn(
-                    f"{path} is an HDR video ({HDR[curve]}): its colours look pale where they are "
-                    "taken for ordinary ones. Convert it to SDR (tone mapping) before."
+                    f"{path} is an HDR video ({HDR[curve]}): without tone mapping its colours are "
+                    "pale. Convert it to SDR first."
                 )
             size = (stream.codec_context.height, stream.codec_context.width)
             return Video(path, size, len(stamps), stream.average_rate, times)
@@ -76,7 +76,7 @@ def frames(path: Path, numbers: range) -> Iterator[np.ndarray]:
 
     Args:
         path: The file.
-        numbers: Numbers of the frames, from 0 on, ascending.
+        numbers: Indices of the frames, from 0, ascending.
 
     Returns:
         Colours of each frame. uint8 [h, w, 3]
@@ -89,12 +89,12 @@ def frames(path: Path, numbers: range) -> Iterator[np.ndarray]:
     try:
         with av.open(str(path)) as container:
             stream = _stream(path, container)
-            stream.codec_context.thread_count = 1  # Other videos are decoded at the same time.
+            stream.codec_context.thread_count = 1  # Several videos are decoded in parallel.
             for number, frame in enumerate(container.decode(stream)):
                 if frame.rotation:
                     raise SceneError(
                         f"{path} is to be shown rotated by {frame.rotation} degrees, so that its "
-                        "pixels are not those of its calibration. Encode it upright: ffmpeg -i "
+                        "pixels do not match its calibration. Encode it upright: ffmpeg -i "
                         f"{path.name} upright{path.suffix}"
                     )
                 if number in numbers:
@@ -104,7 +104,7 @@ def frames(path: Path, numbers: range) -> Iterator[np.ndarray]:
     except av.FFmpegError as problem:
         raise _unreadable(path, problem) from problem
     raise SceneError(
-        f"{path} ends after frame {number}, but frame {numbers[-1]} is wanted: it is probably "
+        f"{path} ends after frame {number}, but frame {numbers[-1]} is needed: it is probably "
         f"truncated. Download it again, or set data.frames=[{numbers[0]},{number},{numbers.step}]."
     )
 

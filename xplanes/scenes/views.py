@@ -16,16 +16,16 @@ from xplanes.scenes.matte import silhouette_of
 from xplanes.scenes.store import PixelFile, StoredImages
 
 PALE_STEPS, PALE_EDGE = 16, 0.9
-"""Steps of 255 by which background pixels differ at most; their least share of an image's edge."""
+"""Largest difference, out of 255, from the background's colour; its least share of the edge."""
 
 RIM = 0.02
 """Width of an image's edge, as a share of its smaller side."""
 
 MOST_EDGES = 32
-"""Views whose edges are sampled, spread evenly."""
+"""Number of views, evenly spread, whose edges are sampled."""
 
 SAME_CAMERA = 1e-4
-"""Share by which intrinsics of one camera differ at most."""
+"""Largest relative difference between intrinsics of one camera."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class Intrinsics:
 
     Attributes:
         focal: Focal lengths along x and y. float64 [V, 2]
-        centre: Principal points, x from the left and y from the top; half of width and height where
-            images are centred. float64 [V, 2]
+        centre: Principal points, x from the left and y from the top; half of width and height for
+            centred images. float64 [V, 2]
         size: Height and width of each image. int64 [V, 2]
-        lenses: Lenses that distort the images; None where all cameras are pinholes.
+        lenses: Lenses that distort the images; None if all cameras are pinholes.
     """
 
     focal: Tensor
@@ -50,7 +50,7 @@ class Intrinsics:
             value = getattr(self, name)
             if value.shape != (len(self.size), 2):
                 raise ValueError(f"intrinsics.{name} is {list(value.shape)}, but must be [V, 2]")
-            # Wider than rays, so that sizes and angles made of them are as exact as the files.
+            # In double precision, so that derived sizes and angles are as exact as the files.
             kind = torch.int64 if name == "size" else torch.float64
             object.__setattr__(self, name, value.to(kind))
         if self.lenses is not None:
@@ -67,7 +67,7 @@ class Intrinsics:
 
     @classmethod
     def shared(cls, focal: float, height: int, width: int, count: int) -> "Intrinsics":
-        """Those of ``count`` centred images of one camera with square pixels."""
+        """Intrinsics of ``count`` centred images of one camera with square pixels."""
         return cls(
             torch.full((count, 2), focal, dtype=torch.float64),
             torch.tensor([0.5 * width, 0.5 * height], dtype=torch.float64).repeat(count, 1),
@@ -75,12 +75,12 @@ class Intrinsics:
         )
 
     def subset(self, indices: Tensor) -> "Intrinsics":
-        """Those of the images at ``indices``, in that order. [K]"""
+        """Intrinsics of the images at ``indices``, in that order. [K]"""
         lenses = None if self.lenses is None else self.lenses[indices]
         return Intrinsics(self.focal[indices], self.centre[indices], self.size[indices], lenses)
 
     def joined(self, other: "Intrinsics") -> "Intrinsics":
-        """These, then those of ``other``."""
+        """These intrinsics, then those of ``other``."""
         return Intrinsics(
             torch.cat([self.focal, other.focal]),
             torch.cat([self.centre, other.centre]),
@@ -93,7 +93,7 @@ class Intrinsics:
 
     @property
     def is_shared(self) -> bool:
-        """Whether all images have the same, as those of one camera."""
+        """Whether all images have the same intrinsics."""
         room = SAME_CAMERA * self.size.max()
         pairs = [
             (self.focal / self.focal[0] - 1, SAME_CAMERA),
@@ -113,7 +113,7 @@ class Intrinsics:
 
     @cached_property
     def sights(self) -> list[Sight] | None:
-        """What each image sees through its lens; None where all cameras are pinholes. [V]"""
+        """Field of view of each image through its lens; None if all cameras are pinholes. [V]"""
         if self.lenses is None:
             return None
         known: dict[tuple[float, ...], Sight] = {}
@@ -134,15 +134,15 @@ class Intrinsics:
         return found
 
     def has_ray(self, index: int) -> Tensor | None:
-        """Which pixels of image ``index`` its lens maps a direction to; None for all. bool [h, w]
+        """Pixels of image ``index`` to which its lens maps a direction; None for all. bool [h, w]
 
-        The corners of fisheye images show nothing.
+        For example, the corners of fisheye images have no rays.
         """
         return None if self.sights is None else self.sights[index].has_ray
 
     @property
     def pinhole(self) -> Tensor:
-        """Focal lengths of pinholes that see as much, where only a pinhole will do. [V, 2]"""
+        """Focal lengths of pinholes with the same field of view, to replace lenses. [V, 2]"""
         if self.sights is None:
             return self.focal
         return torch.tensor([each.pinhole for each in self.sights], dtype=torch.float64)
@@ -153,7 +153,7 @@ class Intrinsics:
         return 2 * math.atan(float((0.5 * self.size[:, 0] / self.pinhole[:, 1]).median()))
 
     def focal_at(self, size: int) -> float:
-        """Focal length of a picture ``size`` pixels wide that shows as much as the median image."""
+        """Focal length for ``size`` pixels of width and the median image's field of view."""
         longer = self.size.amax(dim=1)
         return float((self.pinhole.mean(dim=1) * size / longer).median())
 
@@ -163,7 +163,7 @@ class Views:
     """The images of one split with their cameras and times.
 
     Images may differ in size. Smaller ones are padded with zeros at the bottom and on the right.
-    `image`, `composite` and `image_rays` leave the padding out.
+    `image`, `composite` and `image_rays` exclude the padding.
 
     Attributes:
         images: RGB premultiplied by alpha, and alpha, as a tensor or a reader of a file of pixels.
@@ -215,7 +215,7 @@ class Views:
 
     @property
     def height(self) -> int:
-        """Rows of the highest image."""
+        """Rows of the tallest image."""
         return self.images.shape[1]
 
     @property
@@ -230,12 +230,12 @@ class Views:
 
     @property
     def pixels(self) -> int:
-        """Pixels of all images, without padding."""
+        """Number of pixels of all images, without padding."""
         return int(self.intrinsics.size.prod(dim=1).sum())
 
     @property
     def is_cut(self) -> bool:
-        """Whether some pixels are left out: padding, those without a ray, and ignored ones."""
+        """Whether some pixels are left out: padding, pixels without a ray, and ignored ones."""
         sights = self.intrinsics.sights or []
         return (
             self.is_padded
@@ -274,7 +274,7 @@ class Views:
 
     @property
     def identity(self) -> Any:
-        """What distinguishes these images from others: their bytes, or their sources."""
+        """Key that identifies these images: their bytes, or their sources."""
         return self.images if isinstance(self.images, Tensor) else self.images.identity
 
     def size(self, index: int) -> tuple[int, int]:
@@ -295,7 +295,7 @@ class Views:
     def shown(self, index: int) -> Tensor | None:
         """Pixels of image ``index`` that are trained on and scored; None for all. bool [h, w]
 
-        The others are ignored, or the lens maps no direction to them.
+        Others are ignored, or have no ray.
         """
         has_ray = self.intrinsics.has_ray(index)
         if self.ignored is None:
@@ -304,7 +304,7 @@ class Views:
         return shown if has_ray is None else shown & has_ray
 
     def foreground_in(self, index: int) -> Tensor | None:
-        """Share of each pixel of image ``index`` that shows the foreground object. uint8 [h, w]
+        """Coverage of each pixel of image ``index`` by the foreground object. uint8 [h, w]
 
         None if unknown.
         """
@@ -326,7 +326,7 @@ class Views:
         return silhouette_of(self.image(index)[..., 3])
 
     def valid(self) -> Tensor:
-        """Which pixels show something: no padding, and a ray leads there. bool [V, H, W]"""
+        """Pixels with a ray that are not padding. bool [V, H, W]"""
         height, width = self.intrinsics.size.unbind(dim=1)
         rows = torch.arange(self.height) < height[:, None]
         columns = torch.arange(self.width) < width[:, None]
@@ -372,12 +372,12 @@ class Views:
         )
 
     def composite(self, index: int, background: Tensor) -> Tensor:
-        """Image ``index`` as floats in [0, 1] in front of ``background`` [3]. [h, w, 3]"""
+        """Image ``index`` as floats in [0, 1], composited on ``background`` [3]. [h, w, 3]"""
         image = self.image(index).float() / 255
         return image[..., :3] + (1 - image[..., 3:]) * background
 
     def edge_share_of(self, index: int, colour: Tensor) -> float:
-        """Share of the pixels at the edge of image ``index`` that look like a colour. [3]"""
+        """Share of the pixels at the edge of image ``index`` that have about a colour. [3]"""
         image, has_ray = self.image(index), self.shown(index)
         pale = (image[..., :3].short() - (255 * colour).short()).abs().amax(dim=-1) < PALE_STEPS
         edge = torch.ones_like(pale) if has_ray is None else has_ray.clone()
@@ -404,7 +404,7 @@ class Views:
     def outline_rays(self, index: int) -> tuple[Tensor, Tensor]:
         """Rays through the outline of the silhouette of image ``index``.
 
-        These are its pixels that have a neighbour outside of it, or lie at the image's edge.
+        The outline is its pixels that have a neighbour outside it, or lie at the image's edge.
 
         Returns:
             Origins and unit directions in the world. [N, 3], [N, 3]
@@ -419,7 +419,7 @@ class Views:
         """Rays through pixels of any images.
 
         Args:
-            views: Number of the image of each ray. int64 [R]
+            views: Index of the image of each ray. int64 [R]
             rows: Pixel rows, from 0 at the top. [R]
             columns: Pixel columns, from 0 at the left. [R]
 
@@ -442,7 +442,7 @@ def joined(first: Views, second: Views) -> Views:
     height, width = max(first.height, second.height), max(first.width, second.width)
 
     def together(parts: Sequence[Tensor]) -> Tensor:
-        """Images with zeros at the bottom and on the right. [V, h, w, C] each"""
+        """Images, padded with zeros at the bottom and on the right. [V, h, w, C] each"""
         whole = parts[0].new_zeros(sum(map(len, parts)), height, width, *parts[0].shape[3:])
         for part, room in zip(parts, whole.split([*map(len, parts)]), strict=True):
             room[:, : part.shape[1], : part.shape[2]] = part
@@ -468,7 +468,7 @@ def joined(first: Views, second: Views) -> Views:
 
 
 def _stored(views: Views) -> StoredImages:
-    """The images as if they were in a file."""
+    """The images in the form of images in a file."""
     if isinstance(views.images, StoredImages):
         return views.images
     return StoredImages.all_of(PixelFile.of(views.image(index) for index in range(len(views))))
@@ -486,9 +486,9 @@ class Scene:
         static_reason: Why the scene is known to be static; empty if it may be dynamic.
         points: Surface points in the world, such as from structure from motion; None if unknown.
             float32 [N, 3]
-        cut: Training views masked to the foreground object, for LRMs, while ``splits`` show whole
-            images; None if the alpha of ``splits`` holds the masks, or there are no masks.
-        notes: What reading the scene revealed: sentences by subject.
+        cut: Training views masked to the foreground object, for LRMs, if ``splits`` show whole
+            images; None if the alpha of ``splits`` contains the masks, or there are no masks.
+        notes: Observations made while reading the scene: sentences by subject.
     """
 
     name: str
@@ -502,10 +502,10 @@ class Scene:
 
     @cached_property
     def is_surrounded(self) -> bool:
-        """Whether the training images show surroundings, not a plain background.
+        """Whether the training images show surroundings instead of a constant background.
 
-        True if no pixel is fully transparent and, in a sample of the images, at most half have
-        edges of the background's colour.
+        True if no pixel is fully transparent and, in a sample of the images, the edges of at most
+        half have the background's colour.
         """
         views = self.splits["train"]
         if not views.is_opaque:

@@ -1,4 +1,4 @@
-"""A progress line."""
+"""The progress line."""
 
 import sys
 import time
@@ -17,11 +17,11 @@ PIPED_SECONDS = 30.0
 class StepBar(ProgressBar):
     """Shows steps, rays per second, PSNR and time left.
 
-    On a terminal one line is redrawn; elsewhere a plain line appears every 30 s, without control
+    On a terminal one line is redrawn; elsewhere a new line is written every 30 s, without control
     codes.
 
     Args:
-        stream: Where to write; the terminal's output when None.
+        stream: Output stream; standard output when None.
     """
 
     def __init__(self, stream: TextIO | None = None) -> None:
@@ -62,7 +62,7 @@ class StepBar(ProgressBar):
             self.stream.write("\n")
 
     def line(self, trainer: Trainer, module: LightningModule) -> str:
-        """The line for the present state."""
+        """The line for the current state."""
         assert isinstance(module, RadianceModule)
         seconds, rays = training_seconds(trainer), module.tally.counts["rays"]
         clock = find_callback(trainer, TrainingClock)

@@ -1,4 +1,4 @@
-"""What a training run is built of: the field with its model and sampler, of a scene or a file."""
+"""Builds a field with its model and sampler, from a scene or a checkpoint."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,22 +18,22 @@ from xplanes.scenes.frame import Frame, frame_content, pixels_of_detail, read_fr
 from xplanes.scenes.views import Scene
 
 ANOTHER_SEED = 1_000_003
-"""Added to the seed of a field that is initialised again."""
+"""Added to the seed when a field is re-initialised."""
 
 Initialise = Callable[[Method, Place], Initialisation]
 
 
 @dataclass(frozen=True)
 class Parts:
-    """A field and what trains it.
+    """A field with its model and sampler.
 
     Attributes:
-        settings: The model's settings, as the initialisation left them.
-        site: What the field was built for.
+        settings: The model's settings, with those that the initialisation determines.
+        site: Context for which the field was built.
         model: The model, which has the field.
-        sampler: Renders the field.
-        initialisation: Where the initial values came from, without the sparse part, which the model
-            holds; None if they were loaded.
+        sampler: The sampler, which renders the field.
+        initialisation: The initialisation without the sparse part, which the model keeps; None if
+            the field was loaded.
     """
 
     settings: ModelSettings
@@ -59,7 +59,7 @@ class Parts:
         values = None if initialisation is None else initialisation.values
         model = settings.build(site, values)
         if initialisation is not None and values is not None:
-            # It is large, and of use for some steps only.
+            # The sparse part is large; only the model keeps it, until L_r has faded.
             initialisation = replace(initialisation, values=replace(values, sparse=None))
         field: Any = model.field
         if not isinstance(field, Representation):
@@ -73,7 +73,7 @@ class Parts:
         return cls(settings, site, model, sampler, initialisation)
 
     def stronger(self) -> "Parts":
-        """The same with another seed and the model's settings for a field that shows nothing."""
+        """The parts with another seed and the model's settings for a restart after a collapse."""
         settings = self.settings.stronger()
         assert settings is not None
         site, found = replace(self.site, seed=self.site.seed + ANOTHER_SEED), self.initialisation
@@ -101,7 +101,7 @@ def build_parts(
         half_side: Half the side of the scene's cube in world units; estimated when None.
         device: Device on which the field will be trained; the CPU when None.
         devices: Number of processes that share the run.
-        initialise: Function that makes the initialisation; taken from ``lrm`` when None.
+        initialise: Function that computes the initialisation; taken from ``lrm`` when None.
         frame: The field's frame; chosen by the model when None.
         say: Function that receives a status line before each slow operation.
 
@@ -117,10 +117,10 @@ def build_parts(
     found = Initialisation(method.model, frame)
     if initialise is not None:
         found = initialise(method, Place(scene, frame, device, devices, say, half_side))
-    settled = rays.on(device)
+    resolved = rays.on(device)
     site = Site(
         frame=found.frame,
-        # In a field without time planes all views are of one timestep.
+        # For a field without time planes all views have the same time.
         times=torch.zeros_like(views.times) if found.model.is_static else views.times,
         seed=method.seed,
         precision=precision_of(found.model, device),
@@ -130,8 +130,8 @@ def build_parts(
         pixels=pixels_of_detail(views, found.frame, scene.is_surrounded),
         surrounded=scene.is_surrounded,
         device=device,
-        samples_per_batch=settled.most_samples,
-        batch_scale=settled.most / rays.most if rays.most else 1.0,
+        samples_per_batch=resolved.most_samples,
+        batch_scale=resolved.most / rays.most if rays.most else 1.0,
     )
     parts = Parts.assemble(found.model, site, found)
     assert parts.initialisation is not None
@@ -140,7 +140,7 @@ def build_parts(
 
 
 def site_content(parts: Parts) -> dict[str, Any]:
-    """What data and LRM determine about a field, as plain values and tensors."""
+    """What data and LRM determine about a field, as builtins and tensors."""
     site = parts.site
     return {
         "model": parts.settings.plain(),
@@ -156,21 +156,21 @@ def site_content(parts: Parts) -> dict[str, Any]:
 def parts_from(
     content: Mapping[str, Any], method: Method, modules: Sequence[str], samples: int | None
 ) -> Parts:
-    """Build a field without its data, for weights that are about to be loaded.
+    """Build a field without its data, before its weights are loaded.
 
     Args:
-        content: What `site_content` gave.
+        content: Result of `site_content`.
         method: All settings except those of the data and the Trainer.
         modules: The user's modules whose classes ``content`` may name.
         samples: Samples per training batch.
 
     Raises:
-        ConfigError: If the content names a class that may not stand there.
+        ConfigError: If the content names a class that is not allowed.
     """
     with plugins(modules):
         settings = build(content["model"], ModelSettings, "model")
     if not content["initialised"] or settings.name != method.model.name:
-        settings = method.model  # Weights of another one will not fit.
+        settings = method.model  # If it is another model, loading its weights will fail.
     site = Site(
         frame=read_frame(content["frame"], "the checkpoint"),
         times=content["times"],
@@ -185,10 +185,10 @@ def parts_from(
 
 
 def require_frame(parts: Parts, content: Mapping[str, Any]) -> None:
-    """Refuse planes that were trained in another frame than the initialisation lies in now.
+    """Refuse a checkpoint whose planes were trained in another frame than the initialisation's.
 
     Raises:
-        ConfigError: Naming what differs.
+        ConfigError: With the difference.
     """
     trained = read_frame(content["frame"], "the checkpoint")
     if not (parts.site.initialised and content["initialised"]):
@@ -198,9 +198,9 @@ def require_frame(parts: Parts, content: Mapping[str, Any]) -> None:
         if not torch.allclose(before, torch.as_tensor(now), rtol=1e-4, atol=1e-5):
             raise ConfigError(
                 f"the initialisation was computed again, and its frame is not the checkpoint's "
-                f"({name} {before.tolist()}, now {torch.as_tensor(now).tolist()}): what "
-                "preparation.cache kept is gone. Bring it back, or start a new run "
-                "in another folder"
+                f"({name} {before.tolist()}, now {torch.as_tensor(now).tolist()}): its entry in "
+                "preparation.cache is gone. Restore it, or start a new run in another "
+                "folder"
             )
 
 
@@ -212,10 +212,10 @@ def precision_of(settings: ModelSettings, device: torch.device) -> str:
 
 
 def require_version(path: Any) -> None:
-    """Refuse a checkpoint of a version whose settings were others.
+    """Refuse a checkpoint of a version with different settings.
 
     Args:
-        path: The file; what is no local file, or cannot be read, is left to others.
+        path: The file; paths that are not readable local files are ignored.
 
     Raises:
         ConfigError: With the version.
@@ -223,7 +223,7 @@ def require_version(path: Any) -> None:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
         made = str(content.get("xplanes", "0.2 or older"))
-    except Exception:  # Whoever loads it says what is wrong.
+    except Exception:  # The loading function reports the problem.
         return
     if made.split(".")[:2] != __version__.split(".")[:2]:
         raise ConfigError(
@@ -236,12 +236,12 @@ def require_whole_floats(precision: str) -> None:
     """Refuse a Trainer that changes the precision: the model sets its own.
 
     Raises:
-        ConfigError: With what to set instead.
+        ConfigError: With the setting to use instead.
     """
     if precision not in ("32", "32-true"):
         raise ConfigError(
-            f"precision={precision}: a field computes in model.precision (auto, 32 or bf16), and "
-            "its planes are float32; leave it out"
+            f"precision={precision}: the precision of products is model.precision (auto, 32 or "
+            "bf16), and planes are float32; leave it out"
         )
 
 
@@ -249,7 +249,7 @@ def require_groups(model: Model, sampler: Sampler) -> None:
     """Refuse parameter groups that training cannot work with.
 
     Raises:
-        ConfigError: With what a group consists of.
+        ConfigError: With an example of a complete group.
     """
     wanted = ("params", "lr", "name")
     whole = '{"params": list(field.parameters()), "lr": 0.001, "name": "field"}'

@@ -1,4 +1,4 @@
-"""Checkpoints that are never half-written, and loading them as data."""
+"""Checkpoints: written atomically, and loaded as data."""
 
 import io
 import logging
@@ -27,11 +27,11 @@ logger = logging.getLogger(__name__)
 LAST, BEST = "last.ckpt", "best.ckpt"
 
 TENSORS = ("state_dict", "optimizer_states")
-"""Parts of a checkpoint that are large, and tensors alone."""
+"""Large parts of a checkpoint, which contain only tensors."""
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes checkpoints whole or not at all, and loads them as data, checksums included."""
+    """Writes checkpoints atomically, and loads them as data, with a check of their checksums."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
@@ -45,10 +45,10 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 def _require_data(checkpoint: Mapping[str, Any]) -> None:
-    """Refuse what could be written but not read again, such as a callback's numbers of numpy.
+    """Refuse a state that could be written but not read, such as numpy numbers in a callback.
 
     Raises:
-        ConfigError: Naming what holds it.
+        ConfigError: With the name of the part that contains it.
     """
     parts = {name: part for name, part in checkpoint.items() if name not in TENSORS}
     parts |= {f"callback {name}": state for name, state in parts.pop("callbacks", {}).items()}
@@ -67,7 +67,7 @@ def _require_data(checkpoint: Mapping[str, Any]) -> None:
 
 
 def _kind_in(error: pickle.UnpicklingError) -> str:
-    """The class that was refused, in brackets; empty where it is not named."""
+    """The class that was refused, in brackets; empty if the error does not name it."""
     kind = re.search(r"GLOBAL (\S+)", str(error))
     return f" ({kind[1]})" if kind else ""
 
@@ -75,8 +75,8 @@ def _kind_in(error: pickle.UnpicklingError) -> str:
 class Checkpoints(ModelCheckpoint):
     """Writes ``last.ckpt`` at fixed intervals and at the end, ``best.ckpt`` at a new best score.
 
-    They go to ``checkpoints`` in the trainer's ``default_root_dir``; writing them is off the
-    training clock. The best is that with the highest ``val/psnr``.
+    They are in ``checkpoints`` in the trainer's ``default_root_dir``; the training clock does not
+    count the time to write them. The best one has the highest ``val/psnr``.
 
     Args:
         every: Steps between checkpoints.
@@ -102,10 +102,10 @@ class Checkpoints(ModelCheckpoint):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        # Gradients of batches that wait for others are in no checkpoint.
+        # Never between accumulated batches: checkpoints do not contain gradients.
         whole = getattr(pl_module, "between_updates", True)
         self._due = whole and trainer.global_step % self.every == 0
-        # Otherwise it waits for the scores, so that it records the best one.
+        # Before a validation the checkpoint waits for its scores, so that it records the best one.
         validates = trainer.val_check_batch == trainer.fit_loop.epoch_loop.total_batch_idx + 1
         if self._due and not validates:
             self._save_last(trainer)
@@ -123,7 +123,7 @@ class Checkpoints(ModelCheckpoint):
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
-        # Any other interrupt may have come in the middle of a step.
+        # Any other interrupt may have occurred in the middle of a step.
         if isinstance(exception, Stopped) and trainer.global_step:
             self._save_last(trainer)
 
@@ -131,7 +131,7 @@ class Checkpoints(ModelCheckpoint):
         self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
 
     def _should_skip_saving_checkpoint(self, trainer: Trainer) -> bool:
-        # The last scores may come after training, see `Trainer.train`.
+        # Allowed after training, too: the last scores may come then, see `Trainer.train`.
         return trainer.sanity_checking or not trainer.global_step
 
     def _save_checkpoint(self, trainer: Trainer, filepath: str) -> None:
@@ -143,7 +143,7 @@ class Checkpoints(ModelCheckpoint):
             super()._save_checkpoint(trainer, filepath)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        # The run directory may have moved.
+        # The run directory may have been moved.
         best = f"{self.dirpath}/{BEST}"
         score = state_dict["best_model_score"]
         moved = {"dirpath": self.dirpath, "kth_best_model_path": best, "best_model_path": best}
@@ -152,15 +152,15 @@ class Checkpoints(ModelCheckpoint):
 
 
 def has_checkpoint(run: Path) -> bool:
-    """Whether a run directory holds a checkpoint to go on from."""
+    """Whether a run directory contains a checkpoint to resume from."""
     return (run / "checkpoints" / LAST).is_file()
 
 
 def find_resumable(folder: Path) -> Path | None:
-    """The checkpoint that training goes on from; the best takes the place of a damaged last one.
+    """The checkpoint to resume from; if the last one is damaged, the best one replaces it.
 
     Returns:
-        ``last.ckpt``; None where there is none, so that training starts afresh.
+        ``last.ckpt``; None if there is none, so that training starts from the beginning.
 
     Raises:
         ConfigError: If neither can be read.
@@ -195,7 +195,7 @@ def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
     if (other := stand_in(path)) is not None:
         raise ConfigError(f"{path} {other}")
     try:
-        # torch reads changed bytes silently, though it keeps their checksums.
+        # torch stores checksums but does not check them.
         with zipfile.ZipFile(path) as archive:
             if (name := archive.testzip()) is not None:
                 raise zipfile.BadZipFile(f"wrong checksum of {name}")

@@ -15,13 +15,13 @@ C = TypeVar("C", bound=Callback)
 
 
 SHARED = 8
-"""Batches between two synchronisations of processes that share a run: of their clocks, and of
-whether to stop."""
+"""Batches between synchronisations of a distributed run's processes: of their clocks, and of
+requests to stop."""
 
 
 def agreeing(trainer: Trainer) -> bool:
-    """Whether the processes synchronise after this batch; true at each batch of a single one."""
-    # An epoch may have fewer batches, so that their number in it would never be reached.
+    """Whether the processes synchronise after this batch; always true for a single process."""
+    # Counted over all epochs, because an epoch may have fewer batches than the interval.
     batches = trainer.fit_loop.epoch_loop.total_batch_idx + 1 if trainer.world_size > 1 else 0
     return batches % SHARED == 0
 
@@ -29,14 +29,14 @@ def agreeing(trainer: Trainer) -> bool:
 class TrainingClock(Callback):
     """Counts the seconds spent on training, and ends training when they are used up.
 
-    Drawing rays counts; validation, scores, images and checkpoints do not: such work is done inside
-    `off_clock`. Work queued on a GPU counts as well. Works in any Trainer.
+    Drawing rays counts, and so does work queued on a GPU. Validation, scores, images and
+    checkpoints do not: they run inside `off_clock`. Works in any Trainer.
 
     Args:
         max_seconds: Seconds after which training ends; None for no limit.
 
     Attributes:
-        seconds: Seconds counted so far, those before a resume included.
+        seconds: Seconds counted so far, including those before a resume.
     """
 
     def __init__(self, max_seconds: float | None = None) -> None:
@@ -47,7 +47,7 @@ class TrainingClock(Callback):
 
     @property
     def progress(self) -> float:
-        """Share of the seconds that is used up."""
+        """Share of the time budget that has been used."""
         return 0.0 if self.max_seconds is None else self.seconds / self.max_seconds
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -64,19 +64,19 @@ class TrainingClock(Callback):
         now = time.perf_counter()
         spent = now - self._mark
         if trainer.world_size > 1:
-            # All ranks must agree on when to stop and on the learning rate.
+            # All ranks must stop at the same step and use the same learning rate.
             shared = torch.tensor(spent, device=pl_module.device)
             spent = float(trainer.strategy.reduce(shared, reduce_op="mean"))
         self.seconds += spent
         self._mark = now
         over = self.max_seconds is not None and self.seconds >= self.max_seconds
-        # Modules that gather batches for an update say where one is whole.
+        # Modules that accumulate gradients tell when an update is complete.
         if over and getattr(pl_module, "between_updates", True):
             trainer.should_stop = True
 
     @contextmanager
     def off(self) -> Iterator[None]:
-        """Leave out what happens inside."""
+        """Do not count the time of the block."""
         synchronize(self._device)
         began = time.perf_counter()
         try:
@@ -107,14 +107,14 @@ class TrainingClock(Callback):
 
 
 def find_callback(trainer: Trainer, kind: type[C]) -> C | None:
-    """The first callback of a kind that a trainer has, if any."""
+    """The trainer's first callback of a class, if any."""
     callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
     return next((callback for callback in callbacks if isinstance(callback, kind)), None)
 
 
 @contextmanager
 def off_clock(trainer: Trainer) -> Iterator[None]:
-    """Keep what happens inside off the training clock."""
+    """Exclude the time of the block from the training clock."""
     clock = find_callback(trainer, TrainingClock)
     if clock is None:
         yield

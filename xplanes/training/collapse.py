@@ -1,4 +1,4 @@
-"""Detects fields that become empty or foggy, and restarts them once."""
+"""Detects fields that collapse to empty space or fog, and re-initialises them."""
 
 import logging
 import math
@@ -16,28 +16,28 @@ WINDOW = 100
 """Steps over which opacities are averaged."""
 
 NOTHING = 0.05
-"""Mean opacity of foreground rays below which a field shows nothing."""
+"""Mean opacity of foreground rays below which a field counts as empty."""
 
 FOG = 0.5
-"""Mean opacity of background rays above which a field is fog."""
+"""Mean opacity of background rays above which a field counts as fog."""
 
 FIRST_FOG = 400
-"""Steps in which fog may still lift by itself."""
+"""Steps during which fog may still clear by itself."""
 
 
 class CollapseWatch(Callback):
-    """Detects a field that is empty where the images show an object, or fog where they do not.
+    """Detects a field that is empty where the images show an object, or fog where they show none.
 
     The field is then re-initialised with another seed and the model's settings for this case
-    (`ModelSettings.stronger`). If that does not help, or the model has none, like the published
-    baselines, it warns, and training continues to the end of its budget.
+    (`ModelSettings.stronger`). If that does not help, or the model has no such settings, like the
+    published baselines, the callback warns, and training continues to the end of its budget.
 
     Args:
         restarts: Maximum number of re-initialisations; 0 for a warning only.
 
     Attributes:
         restarted: Steps of re-initialisations.
-        collapsed: Description of what was detected last; empty if nothing was.
+        collapsed: Description of the last collapse; empty if there was none.
     """
 
     def __init__(self, restarts: int = 1) -> None:
@@ -94,11 +94,11 @@ class CollapseWatch(Callback):
 
 
 def verdict(seen: list[tuple[float, float]], *, fog: bool) -> str:
-    """Diagnosis of a field by mean opacities of foreground and background rays; empty if sound.
+    """Diagnosis by mean opacities of foreground and background rays; empty if there is no collapse.
 
     Args:
-        seen: One pair for each step, from 0 to 1; NaN where a batch had no such rays.
-        fog: Whether fog counts.
+        seen: One pair for each step, from 0 to 1; NaN if a batch had no such rays.
+        fog: Whether to check for fog.
     """
     foreground, background = (
         [value for value in values if not math.isnan(value)] for values in zip(*seen, strict=True)

@@ -32,7 +32,7 @@ class _Writer(ExperimentWriter):
         self._file = Path(log_dir) / self.NAME_METRICS_FILE
         self._earlier: list[dict[str, Any]] = list(read_rows(self._file))
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".* exists and is not empty")  # It deletes the file.
+            warnings.filterwarnings("ignore", ".* exists and is not empty")  # Rows are kept here.
             super().__init__(log_dir)
         self._begin_with(self._earlier)
 

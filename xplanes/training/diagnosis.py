@@ -1,4 +1,4 @@
-"""Losses and gradients that are not finite: steps without them, and what to tell the user."""
+"""Losses and gradients that are not finite: skipped steps, and messages for the user."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,8 +21,8 @@ class TrainingError(XPlanesError, RuntimeError):
 def usable(gradient: Tensor) -> bool:
     """Whether an optimiser can use a gradient: the sum of its squares is finite.
 
-    Adam keeps the squares. One that overflows its type would stay infinite for ever and hold its
-    parameter where it is, without a NaN anywhere.
+    Adam accumulates the squares. One that overflows would stay infinite and freeze its parameter,
+    without a NaN anywhere.
     """
     if gradient.is_contiguous():
         flat = gradient.view(-1)
@@ -35,7 +35,7 @@ def broken_flag(parameters: Iterable[nn.Parameter], losses: Sequence[Tensor]) ->
 
     Args:
         parameters: Parameters, some of which may have no gradient.
-        losses: Losses of the batches that the gradients are of. [] each
+        losses: Losses of the batches to which the gradients belong. [] each
     """
     gradients = [p.grad for p in parameters if p.grad is not None]
     if losses[0].device.type == "cpu":
@@ -46,10 +46,10 @@ def broken_flag(parameters: Iterable[nn.Parameter], losses: Sequence[Tensor]) ->
 
 
 def leave_out(optimizer: torch.optim.Optimizer, broken: Tensor) -> None:
-    """Make an optimiser skip its next step where a flag is 1.
+    """Make an optimiser skip its next step if a flag is 1.
 
-    Fused Adam takes the flag as that of a gradient scaler, and nothing waits for the device. For
-    other optimisers the gradients are removed.
+    Fused Adam reads the flag as ``found_inf`` of a gradient scaler, so that the host does not wait
+    for the device. For other optimisers the gradients are removed.
     """
     if getattr(optimizer, "_step_supports_amp_scaling", False):
         optimizer.found_inf = broken  # type: ignore[attr-defined]
@@ -63,8 +63,8 @@ def unusable_gradients(named: Iterable[tuple[str, nn.Parameter]]) -> list[str]:
 
 
 def not_finite(named: Iterable[tuple[str, Tensor]]) -> list[str]:
-    """Names of the tensors that hold a NaN or an infinity."""
-    # NaN and infinity survive a product with 0 as NaN; the sum of finite numbers may overflow.
+    """Names of the tensors that contain a NaN or an infinity."""
+    # Times 0, NaN and infinity become NaN; the plain sum of finite numbers could overflow.
     return [name for name, tensor in named if not bool((tensor.detach() * 0).sum() == 0)]
 
 
@@ -74,11 +74,11 @@ def diagnosis(
     terms: Mapping[str, Tensor],
     unusable: Sequence[str] = (),
 ) -> str:
-    """What was not finite for the last updates, and what to change.
+    """Error message: what was not finite in the last updates, and what to change.
 
     Args:
-        module: What is trained.
-        rendering: That of the last batch.
+        module: The module that is trained.
+        rendering: The rendering of the last batch.
         terms: Terms of its loss by name.
         unusable: Parameters whose gradients are not finite.
     """
@@ -90,7 +90,7 @@ def diagnosis(
     density, parameters = rendering.density, not_finite(module.named_parameters())
     seen = {"colour": rendering.colour, "opacity": rendering.opacity, "density": density}
     rays = [f"rendered {name}" for name in not_finite(seen.items())]
-    # A term as the configuration names it, or as one of the model's.
+    # Named by its setting if it was added with ``losses``, else by its name in the model.
     losses = [
         f"losses.{name}" if name in module.method.losses else f"loss term {name}"
         for name in not_finite(terms.items())
@@ -100,29 +100,29 @@ def diagnosis(
     return (
         f"{what} for {count} steps in a row, from step {module.global_step - count + 1} on; not "
         "finite: "
-        f"{', '.join(broken) or 'gradients, or something in another process'}; largest density "
+        f"{', '.join(broken) or 'gradients, or a value in another process'}; largest density "
         f"{float(density.max()) if len(density) else 0:.3g}. "
         f"{_way_out(module, losses, rendered=not (parameters or rays))}"
     )
 
 
 def require_finite(module: "RadianceModule") -> None:
-    """Refuse to go on with, or to keep, parameters that are not finite.
+    """Refuse to continue with, or to save, parameters that are not finite.
 
     Raises:
-        TrainingError: Naming them.
+        TrainingError: With their names.
     """
     if broken := not_finite(module.named_parameters()):
         raise TrainingError(
-            f"not finite at step {module.global_step}: {', '.join(broken)}. No checkpoint was "
-            f"written over the last sound one. {_way_out(module)}"
+            f"not finite at step {module.global_step}: {', '.join(broken)}. The last valid "
+            f"checkpoint was not overwritten. {_way_out(module)}"
         )
 
 
 def _way_out(
     module: "RadianceModule", broken: Sequence[str] = (), *, rendered: bool = False
 ) -> str:
-    """What to change, if these terms are not finite; ``rendered`` if all that was rendered is."""
+    """Advice if these terms are not finite; ``rendered``: the rendering itself is finite."""
     added = [f"losses.{name}" for name in module.method.losses] if rendered else []
     begun = module.tally.done > 0
     resume = "; resume= continues from the last checkpoint" if begun else ""

@@ -1,4 +1,4 @@
-"""Scores views at given times during training, and writes the curve of their scores."""
+"""Evaluations during training, and the curve of their scores."""
 
 import sys
 import time
@@ -19,11 +19,11 @@ from xplanes.training.module import RadianceModule
 from xplanes.training.scores import mean
 
 SHOWN = 4
-"""Views whose images go to the logger at each evaluation."""
+"""Number of views whose images are logged at each evaluation."""
 
 
 FEW_VIEWS, FIRST_SHARE = 4, 0.1
-"""Of scenes with surroundings: views at each evaluation, unless given, and the earliest one."""
+"""Defaults in scenes with surroundings: number of views, and earliest share of the budget."""
 
 CURVE = ("seconds", "step", "split", "psnr", "ssim")
 """Columns of curve.csv."""
@@ -32,10 +32,10 @@ CURVE = ("seconds", "step", "split", "psnr", "ssim")
 def affordable(
     at: Sequence[float], limit: float, surrounded: bool
 ) -> tuple[list[float], int | float]:
-    """When to evaluate, and how many views.
+    """Shares of the budget at which to evaluate, and limit on the number of views.
 
-    In scenes with surroundings all of the cube may be occupied at first, so that a view takes
-    seconds: fewer views than all are scored, and none before the cube has taken shape.
+    In scenes with surroundings the whole cube may be occupied at first, and a view takes seconds to
+    render: by default fewer views are scored, and none before empty space is pruned.
 
     Args:
         at: Shares of the budget at which to evaluate.
@@ -48,19 +48,19 @@ def affordable(
 
 
 class Evaluation(Callback):
-    """Lets Lightning validate at given shares of the budget, and keeps what comes of it.
+    """Makes Lightning validate at given shares of the budget, and saves the results.
 
     The views are those of `SceneDataModule.val_dataloader`; ``trainer.limit_val_batches`` of them
     are scored each time, see `affordable`. Writes curve.csv and images into the trainer's
-    ``default_root_dir``, and gives images to its loggers. All rows of the curve score the same
-    views; a checkpoint holds the rows until then.
+    ``default_root_dir``, and passes images to its loggers. All rows of the curve score the same
+    views; checkpoints contain the rows so far.
 
     Args:
         at: Shares of the budget, from 0 to 1; 1 is always scored.
 
     Attributes:
         step: Step of the last evaluation; -1 before the first.
-        seconds: Time spent on it.
+        seconds: Total time of all evaluations.
     """
 
     def __init__(self, at: Sequence[float] = (0.0, 1.0)) -> None:
@@ -89,7 +89,7 @@ class Evaluation(Callback):
         if trainer.global_step and trainer.is_global_zero:
             forget_later(trainer, trainer.global_step)
         passed = sum(share <= pl_module.progress for share in self.at)
-        # A run that was stopped while scoring scores again; a larger budget passes fewer shares.
+        # A run stopped during an evaluation repeats it; a larger budget has passed fewer shares.
         self._passed = passed if self._passed is None else min(self._passed, passed)
 
     def on_train_batch_end(
@@ -100,7 +100,7 @@ class Evaluation(Callback):
         due = sum(share <= pl_module.progress for share in self.at) > self._passed
         ends = pl_module.progress >= 1
         if (due or ends) and pl_module.between_updates:
-            # Lightning validates after a multiple of this number of batches: now.
+            # Lightning validates after multiples of this number of batches, hence now.
             trainer.val_check_batch = trainer.fit_loop.epoch_loop.total_batch_idx + 1
         else:
             trainer.val_check_batch = sys.maxsize
@@ -149,7 +149,7 @@ class Evaluation(Callback):
             name = tag.replace("/", "_").removesuffix(".png")
             write_png(run / "media" / f"step{step:06d}" / f"{name}.png", picture)
             log_image(trainer, tag, picture, step)
-        if trainer.sanity_checking:  # Lightning does not log its scores.
+        if trainer.sanity_checking:  # Lightning does not log scores of a sanity check.
             last = module.tally.last
             scores = {n: last[n] for n in last if n.startswith(("val/", "test/"))}
             for log in trainer.loggers:
@@ -164,10 +164,10 @@ class Evaluation(Callback):
 
 
 def log_image(trainer: Trainer, tag: str, picture: Tensor, step: int) -> None:
-    """Give an image to every logger that takes images; the others have it in the run's media.
+    """Pass an image to every logger that accepts images.
 
     Args:
-        trainer: Has the loggers.
+        trainer: The Trainer with the loggers.
         tag: The image's name.
         picture: Colours from 0 to 1. [H, W, 3]
         step: The training step.

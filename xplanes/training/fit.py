@@ -1,4 +1,4 @@
-"""Lightning's Trainer with a time budget, its warm-up, and short trainings during preparation."""
+"""Lightning's Trainer with a time budget, warm-up, and short training runs for the preparation."""
 
 import copy
 import logging
@@ -43,14 +43,14 @@ class Trainer(lightning.Trainer):
         accelerator: auto (CUDA if there is a GPU, otherwise the CPU), cpu or gpu.
         devices: Number of processes; they split the rays.
         deterministic: Bit-identical runs; CPU only, with a budget in steps.
-        tf32: On GPUs, round the factors of float32 products to TF32 (10 bits), which is faster.
+        tf32: On GPUs, multiply float32 matrices in TF32 (10-bit mantissa), which is faster.
         log_every_n_steps: Steps between log entries; 0 for none.
         callbacks: Callbacks; a `TrainingClock` and an `Interrupt` are added.
         plugins: Lightning's plugins; checkpoints are atomic unless a plugin writes them.
         **others: As for Lightning's Trainer.
 
     Raises:
-        ConfigError: If the machine lacks what is asked for.
+        ConfigError: If the machine lacks the requested devices, or an argument is not supported.
     """
 
     def __init__(
@@ -72,21 +72,21 @@ class Trainer(lightning.Trainer):
         if others.get("overfit_batches", 0) != 0:
             raise ConfigError(
                 f"overfit_batches={others['overfit_batches']}: rays are drawn again at each step; "
-                "leave it out, and set data.views for a field of few images"
+                "leave it out, and set data.views to train on few images"
             )
         require_whole_floats(str(others.get("precision") or "32-true"))
         for callback in callbacks:
             if isinstance(callback, StochasticWeightAveraging):
                 raise ConfigError(
-                    f"callbacks: {type(callback).__name__}: the model's schedules would overrule "
+                    f"callbacks: {type(callback).__name__}: the model's schedules would override "
                     "its learning rates; use lightning.pytorch.callbacks.EMAWeightAveraging"
                 )
         device = find_device(accelerator)
         if device.type == "cuda":
             if deterministic:
                 raise ConfigError(
-                    "deterministic=true: sums on a GPU come out in any order; set "
-                    "trainer.accelerator=cpu, or do without"
+                    "deterministic=true: the order of sums on a GPU varies; set "
+                    "trainer.accelerator=cpu, or leave it out"
                 )
             if isinstance(devices, int) and devices > (found := torch.cuda.device_count()):
                 raise ConfigError(
@@ -98,12 +98,12 @@ class Trainer(lightning.Trainer):
             own.append(AtomicCheckpointIO())
         bar = others.get("enable_progress_bar", True)
         used = [each for each in callbacks if bar or not isinstance(each, ProgressBar)]
-        # These hold for the whole process, the LRM included.
+        # These settings affect the whole process, including the LRM.
         torch.set_float32_matmul_precision("high" if tf32 else "highest")
         torch.backends.cudnn.allow_tf32 = tf32
-        # `Evaluation` says when views are scored; without it, nothing does.
+        # Only `Evaluation` triggers validation.
         usual = {"check_val_every_n_epoch": None, "val_check_interval": sys.maxsize}
-        # Lightning ends after 1000 epochs where no number of steps is given.
+        # By default Lightning ends after 1000 epochs if no number of steps is given.
         usual |= {"num_sanity_val_steps": 0, "max_epochs": -1}
         self.interrupt = Interrupt()
         quiet_lightning()
@@ -121,11 +121,11 @@ class Trainer(lightning.Trainer):
     def train(
         self, module: RadianceModule, data: SceneDataModule, checkpoint: Path | None = None
     ) -> None:
-        """Fit a module whose field is built, from a checkpoint on where one is given.
+        """Fit a module whose field is built, or continue from a checkpoint.
 
         Raises:
             KeyboardInterrupt: If the user stopped it; the state is saved.
-            TrainingError: If numbers stopped being finite.
+            TrainingError: If losses, gradients or parameters are no longer finite.
         """
         device = self.strategy.root_device
         warm_up(module, data, device)
@@ -138,12 +138,12 @@ class Trainer(lightning.Trainer):
                 raise ConfigError(f"callbacks: EarlyStopping: {error}") from error
             evaluation = find_callback(self, Evaluation)
             if evaluation is not None and evaluation.step != self.global_step:
-                # Lightning trains nothing where no step is left, though the end was not scored yet.
+                # With no steps left Lightning skips validation, but the end may not be scored yet.
                 self.validate(module, data, verbose=False)
-        module.to(device)  # Lightning leaves it on the CPU.
+        module.to(device)  # Lightning moves it back to the CPU after training.
 
     def final_scores(self, module: RadianceModule, data: SceneDataModule) -> list[ViewScore]:
-        """Scores of all views of the split to test, those of the last evaluation if it had them."""
+        """Scores of all views of the test split, from the last evaluation if it covered them."""
         views = data.scene.splits[data.test_split]
         evaluation = find_callback(self, Evaluation)
         same = data.test_split == (data.validation_split or data.test_split)
@@ -156,10 +156,10 @@ class Trainer(lightning.Trainer):
 
 
 def find_device(accelerator: str) -> torch.device:
-    """The device of ``trainer.accelerator``: a CUDA GPU where there is one, else the CPU.
+    """The device of ``trainer.accelerator``; auto: a CUDA GPU if there is one, else the CPU.
 
     Raises:
-        ConfigError: If a GPU is asked for and none is found, or for another accelerator.
+        ConfigError: If a GPU is requested but not found, or for another accelerator.
     """
     if accelerator not in ("auto", "cpu", "gpu", "cuda"):
         raise ConfigError(f"accelerator={accelerator}: must be one of auto, cpu, gpu")
@@ -181,21 +181,21 @@ def fit_quietly(
     max_steps: int,
     max_seconds: float | None,
 ) -> None:
-    """Train a field that is built on a scene, from its last checkpoint in a folder on.
+    """Train a built field on a scene, or continue from its last checkpoint in a folder.
 
     Args:
-        module: Changed in place.
+        module: The module; changed in place.
         scene: The scene.
-        folder: Where checkpoints lie.
-        device: Where to train.
-        max_steps: Steps at most.
-        max_seconds: Seconds at most; None for no limit.
+        folder: Folder of the checkpoints.
+        device: Training device.
+        max_steps: Maximum number of steps.
+        max_seconds: Maximum training time in seconds; None for no limit.
     """
     trainer = Trainer(
         accelerator="gpu" if device.type == "cuda" else "cpu",
         max_steps=max_steps,
         max_seconds=max_seconds,
-        # A Trainer sets these for the whole process, and the run's own was there first.
+        # A Trainer sets this for the whole process: keep the setting of the run's own Trainer.
         deterministic=device.type == "cpu" and torch.are_deterministic_algorithms_enabled(),
         tf32=torch.backends.cudnn.allow_tf32,
         callbacks=[CollapseWatch(), Checkpoints(every=250)],
@@ -210,9 +210,9 @@ def fit_quietly(
 
 
 def warm_up(module: RadianceModule, data: SceneDataModule, device: torch.device) -> None:
-    """Run all loops once on a few rays, so that the training clock does not count compiling."""
+    """Run all loops once on a few rays, so that the training clock does not count compilation."""
     if device.type != "cpu":
-        # The kernels are tried where they will run; Lightning would move the module a little later.
+        # The kernels' trial needs the training device; Lightning would move the module only later.
         module.to(device)
     elif not cpu_loops(next(module.field.parameters())):
         return
@@ -232,7 +232,7 @@ def warm_up(module: RadianceModule, data: SceneDataModule, device: torch.device)
 
 
 def rehearse(module: RadianceModule, rays: Batch) -> None:
-    """Do all that a step does on a copy of the field, so that its kernels are compiled."""
+    """Run a complete step on a copy of the field, so that its kernels are compiled."""
     copied, state = copy.deepcopy(module.parts), module.state
     model, sampler = copied.model, copied.sampler
     optimizer = model.optimizer([*model.groups(), *sampler.groups()])
@@ -247,13 +247,13 @@ def rehearse(module: RadianceModule, rays: Batch) -> None:
 
 
 class Estimate(NamedTuple):
-    """How long parts of a run are going to take, measured before its first step.
+    """Expected durations, measured before the first step.
 
     Attributes:
-        step: Seconds of a step.
-        first_ray: Seconds of a ray of an image before empty space is pruned.
-        later_ray: Seconds of a ray afterwards.
-        pruned_at: Step at which it is pruned first.
+        step: Seconds per step.
+        first_ray: Seconds per ray of an image before empty space is pruned.
+        later_ray: Seconds per ray afterwards.
+        pruned_at: First step at which empty space is pruned.
     """
 
     step: float
@@ -263,14 +263,14 @@ class Estimate(NamedTuple):
 
 
 OPAQUE = 1000.0
-"""Factor on the density that makes a field about as opaque as training does."""
+"""Factor on the density that makes an untrained field about as opaque as a trained one."""
 
 
 def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
-    """Time a step and some rays of a scored view.
+    """Time a step, and some rays of a validation view.
 
-    Training makes surfaces opaque, so that rays end after a few samples. A much denser copy of the
-    field stands in for the trained one.
+    In a trained field surfaces are opaque, so that rays end after a few samples. It is approximated
+    by a copy of the field with a much higher density.
     """
     frame, field, renderer = module.frame, module.field, module.renderer
     assert frame is not None
@@ -295,7 +295,7 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         solid = field.masked(lambda points: points.new_full(points.shape[:1], OPAQUE))
         later = _seconds(lambda: renderer.image(solid, origins, directions, *seen_at), device)
         if (background := getattr(field, "background", None)) is not None:
-            with torch.no_grad():  # It shows wherever the cube is empty.
+            with torch.no_grad():  # The background is rendered wherever the cube is empty.
                 later += _seconds(lambda: look(background, origins, directions), device)
     return Estimate(taken, first / len(chosen), later / len(chosen), pruned_at)
 

@@ -1,4 +1,4 @@
-"""Ctrl-C that waits for the end of a step, so that nothing is saved half-updated."""
+"""Graceful Ctrl-C: training stops after the current step, so that the saved state is consistent."""
 
 import signal
 import threading
@@ -14,21 +14,21 @@ from xplanes.training.clock import agreeing
 
 
 class Stopped(KeyboardInterrupt):
-    """Training was asked to stop, and did so between two steps."""
+    """Training was interrupted, and has stopped between two steps."""
 
 
 class Interrupt(Callback):
-    """Turns the first SIGINT or SIGTERM into a stop after the step; the second stops at once."""
+    """The first SIGINT or SIGTERM stops training after the current step, the second at once."""
 
     def __init__(self) -> None:
         self.asked = False
         self._before: dict[int, Any] = {}
 
     def check(self) -> None:
-        """Stop here if asked to; to be called between two steps.
+        """Stop if a signal was received; call it between two steps.
 
         Raises:
-            Stopped: If a signal came.
+            Stopped: If a signal was received.
         """
         if self.asked:
             raise Stopped
@@ -39,9 +39,9 @@ class Interrupt(Callback):
         if not agreeing(trainer):
             return
         if trainer.world_size > 1:
-            # Saving takes all processes: they must stop after the same step.
+            # All processes take part in saving: they must stop after the same step.
             self.asked = trainer.strategy.reduce_boolean_decision(self.asked, all=False)
-        # Modules that gather batches for an update say where one is whole.
+        # Modules that accumulate gradients tell when an update is complete.
         if getattr(pl_module, "between_updates", True):
             self.check()
 
@@ -54,14 +54,14 @@ class Interrupt(Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        if trainer.world_size == 1:  # Else all processes must stop together, after a step.
+        if trainer.world_size == 1:  # Several processes must stop together, after a step.
             self.check()
 
     on_validation_batch_end = on_test_batch_end
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         if self._before or threading.current_thread() is not threading.main_thread():
-            return  # Only the main thread can take signals.
+            return  # Only the main thread can handle signals.
         for number in (signal.SIGINT, signal.SIGTERM):
             self._before[number] = signal.signal(number, self._note)
 
@@ -76,7 +76,7 @@ class Interrupt(Callback):
         """
         try:
             yield
-            self.check()  # For a signal that came after the last step.
+            self.check()  # For a signal after the last step.
         except SystemExit:
             if not self.asked:
                 raise

@@ -1,4 +1,4 @@
-"""What a training step logs."""
+"""Logging of training steps."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 
 def logs_now(trainer: Trainer) -> bool:
-    """Whether a Trainer wants logs of the last batch."""
+    """Whether the last batch is to be logged."""
     every = trainer.log_every_n_steps  # type: ignore[attr-defined]
-    # The Trainer's count, which starts again from 0 when a module was loaded.
+    # The Trainer's own count: it begins at 0 even if the module was loaded.
     batch = trainer.fit_loop.epoch_loop.total_batch_idx + 1
     return bool(every and not batch % every and trainer.loggers)
 
 
 def forget_later(trainer: Trainer, step: int) -> None:
-    """Make TensorBoard drop the points after a step, which an interrupted run has left."""
+    """Make TensorBoard drop points after a step, left by an interrupted run."""
     for log in trainer.loggers:
         if isinstance(log, TensorBoardLogger):
             from tensorboard.compat.proto.event_pb2 import (  # pyright: ignore
@@ -36,7 +36,7 @@ def forget_later(trainer: Trainer, step: int) -> None:
 
 
 def log_terms(module: "RadianceModule", terms: Mapping[str, Tensor], state: TrainingState) -> None:
-    """Log every term of the loss, weighted, where the Trainer wants logs of this step."""
+    """Log every term of the loss, weighted, if this step is to be logged."""
     if not logs_now(module.trainer):
         return
     values = {name: float(term.detach()) for name, term in terms.items()}

@@ -1,4 +1,4 @@
-"""The terms of the loss that need rays."""
+"""The loss terms that need rays."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -22,18 +22,18 @@ def loss_terms(
     rays: Batch,
     state: TrainingState,
 ) -> dict[str, Tensor]:
-    """All terms, weighted, by name: the model's, the sampler's and those added. [] each
+    """Weighted loss terms by name: the model's, the sampler's and additional ones. [] each
 
     Args:
-        parts: What is trained.
+        parts: The field with its model and sampler.
         added: Terms of the group ``losses``.
         rendering: The rendering of the batch.
         rays: The batch.
         state: Seed and progress of training.
 
     Raises:
-        ConfigError: If two terms have one name.
-        TrainingError: If a term is not one number.
+        ConfigError: If two terms have the same name.
+        TrainingError: If a term is not a single number.
     """
     device = rendering.colour.device
     found = parts.model.losses(rendering, rays, state) | parts.sampler.losses(rendering)
@@ -41,7 +41,7 @@ def loss_terms(
     for name, term in added.items():
         if name in found:
             raise ConfigError(
-                f"losses.{name}: the loss has a term of this name already; choose another name"
+                f"losses.{name}: the loss has a term of this name; choose another name"
             )
         value = term.value(parts.field, rendering, rays, state)
         terms[name] = term.weight * _number(value, f"losses.{name}", device)
@@ -49,10 +49,10 @@ def loss_terms(
 
 
 def _number(term: Any, name: str, device: torch.device) -> Tensor:
-    """A term of the loss as a tensor without dimensions. []
+    """A loss term as a tensor without dimensions. []
 
     Raises:
-        TrainingError: If it is not one number.
+        TrainingError: If it is not a single number.
     """
     if isinstance(term, int | float):
         return torch.tensor(float(term), device=device)

@@ -1,4 +1,4 @@
-"""Statistics of training steps: sums on the device, which the host reads at intervals."""
+"""Statistics of training steps: summed on the device, and read by the host at intervals."""
 
 import math
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from xplanes.rendering.base import Rendering
 from xplanes.scenes.batches import Batch
 
 EVERY = 32
-"""Batches between two reads of the sums; fewer at first."""
+"""Batches between two reads of the sums; fewer at the beginning."""
 
 
 def due(batches: int) -> bool:
@@ -21,16 +21,16 @@ def due(batches: int) -> bool:
 
 
 class Meters:
-    """Sums of numbers on the device, for which the host does not wait."""
+    """Sums of numbers on the device; adding does not make the host wait."""
 
     def __init__(self) -> None:
         self._sums: dict[tuple[str, ...], Tensor] = {}
         self._known: dict[str, float] = {}
 
     def add(self, values: Mapping[str, Tensor | float]) -> None:
-        """Add the numbers of a batch: floats, or tensors without axes.
+        """Add the numbers of a batch: floats, or tensors without dimensions.
 
-        Each time the same names, and tensors of the same types.
+        All calls must use the same names and types.
         """
         by_type: dict[torch.dtype, dict[str, Tensor]] = {}
         for name, value in values.items():
@@ -46,7 +46,7 @@ class Meters:
                 self._sums[names] = new.double() if dtype.is_floating_point else new
 
     def read(self) -> dict[str, float]:
-        """The sums since they were read last; waits for the device."""
+        """The sums since the last read; waits for the device."""
         found = self._known
         for names, total in self._sums.items():
             found = found | dict(zip(names, total.tolist(), strict=True))
@@ -55,19 +55,19 @@ class Meters:
 
 
 COUNTS = ("rays", "candidates", "empty", "occluded", "samples", "no_room")
-"""What a run counts: rays, samples in their box, those dropped as empty or occluded, those left,
-and rays left out for want of room on a GPU."""
+"""Counts of a run: rays, samples in their box, those dropped as empty or occluded, remaining ones,
+and rays left out on a GPU because their samples did not fit."""
 
 
 class Tally:
     """Counts of a run, and the loss and opacities of its last batches.
 
     Attributes:
-        counts: Numbers since the start of the run, by the names in `COUNTS`.
+        counts: Counts since the start of the run, by the names in `COUNTS`.
         last: Loss and PSNR of the last batches, mean opacities, and the last scores of views.
-        done: Updates that were not skipped.
-        skipped: Updates that were skipped.
-        skipped_in_a_row: The same, since the last one that was not.
+        done: Number of updates that were not skipped.
+        skipped: Number of updates that were skipped.
+        skipped_in_a_row: Number of skipped updates since the last one that was not.
         opacities: Mean opacities of a recent batch, on its device.
     """
 
@@ -79,11 +79,11 @@ class Tally:
         self._batches, self._updates = Meters(), Meters()
 
     def add_batch(self, values: Mapping[str, Tensor | float]) -> None:
-        """Add a batch: its number of ``batches``, ``all_rays``, ``loss``, ``error``, counts."""
+        """Add a batch: ``batches``, ``all_rays``, ``loss``, ``error`` and the counts."""
         self._batches.add(values)
 
     def add_update(self, broken: Tensor) -> None:
-        """Add an update, which was skipped where the flag is 1. []"""
+        """Add an update, which was skipped if the flag is 1. []"""
         self._updates.add({"updates": 1, "skipped": broken})
         if broken.device.type == "cpu":
             self._read_updates()
@@ -92,10 +92,10 @@ class Tally:
         """Read the sums since the last read, over all processes.
 
         Args:
-            trainer: Whose processes they are.
+            trainer: The Trainer of these processes.
 
         Returns:
-            Numbers of rays and of samples; None if there was no batch.
+            Number of rays and of samples; None if there was no batch.
         """
         self._read_updates()
         if not (found := self._batches.read()):
@@ -129,14 +129,14 @@ class Tally:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state."""
+        """Restore counts and last values."""
         self.counts = dict.fromkeys(COUNTS, 0) | state["counts"]
         self.done, self.skipped = state["done"], state["skipped"]
         self.last = dict(state["last"])
 
 
 def _of_all(values: dict[str, float], trainer: Trainer) -> dict[str, float]:
-    """Sums over all processes, so that they go on with the same numbers."""
+    """Sums over all processes, so that all of them continue with the same numbers."""
     if trainer.world_size == 1:
         return values
     device = trainer.strategy.root_device
@@ -146,7 +146,7 @@ def _of_all(values: dict[str, float], trainer: Trainer) -> dict[str, float]:
 
 
 def batch_values(rendering: Rendering, rays: Batch, loss: Tensor) -> dict[str, Tensor | float]:
-    """What a `Tally` adds up of a batch."""
+    """Numbers of a batch for `Tally.add_batch`."""
     count, samples = len(rays["times"]), rendering.samples
     shown: Tensor | None = getattr(samples, "shown", None)
     values = {name: getattr(samples, name) for name in ("candidates", "empty", "occluded")}
@@ -158,10 +158,10 @@ def batch_values(rendering: Rendering, rays: Batch, loss: Tensor) -> dict[str, T
 
 
 def mean_opacities(rendering: Rendering, rays: Batch) -> dict[str, Tensor]:
-    """Mean opacity of rays that must show something, and of those that must not; NaN for none.
+    """Mean opacity of foreground rays and of background rays; NaN if there are none.
 
-    The former are opaque and of another colour than the background; the latter are transparent.
-    Rays that were left out do not count.
+    Pixels of foreground rays are opaque and differ in colour from the background; those of
+    background rays are transparent. Rays that were left out do not count.
     """
     opacity = rendering.opacity.detach()
     far = (rays["target"] - rays["background"]).abs().amax(dim=-1) > 0.2
@@ -174,5 +174,5 @@ def mean_opacities(rendering: Rendering, rays: Batch) -> dict[str, Tensor]:
 
 
 def masked_mean(values: Tensor, mask: Tensor | None) -> Tensor:
-    """Mean of the values under a mask, without indexing; NaN for none. [N], bool [N] -> []"""
+    """Mean over a mask, without indexing; NaN if it is empty. [N], bool [N] -> []"""
     return values.mean() if mask is None else (values * mask).sum() / mask.sum()

@@ -46,27 +46,27 @@ from xplanes.training.meters import Tally, batch_values, due, mean_opacities
 from xplanes.training.scores import ViewScoring
 
 PATIENCE = 20
-"""Training gives up after this number of updates in a row without finite loss and gradients."""
+"""Training fails after this many consecutive updates with a loss or gradient that is not finite."""
 
 OPACITIES = 5
-"""Batches between two measurements of the rays' opacity."""
+"""Batches between measurements of the rays' opacity."""
 
 
 class RadianceModule(ViewScoring):
     """Trains a field on rays, supervised by the images' colours.
 
-    The field is built in `configure_model`, when the scene is known. An LRM, if configured, runs
-    there too. Checkpoints store what the data and the LRM determine about the field, so
+    The field is built in `configure_model`, when the scene is known; an LRM, if configured, runs
+    there, too. Checkpoints store what the data and the LRM determine about the field, so that
     ``RadianceModule.load_from_checkpoint(path)`` needs only the file (and ``plugins``, if used).
 
-    A step is `training_step` (render the rays, add up the loss), `on_before_optimizer_step`
+    A step is `training_step` (render the rays, sum the loss terms), `on_before_optimizer_step`
     (gradients of regularisers without rays; a step that is not finite is skipped) and
-    `optimizer_step` (the optimiser, then the upkeep of the occupancy grid).
+    `optimizer_step` (the optimiser, then the update of the occupancy grid).
 
     Args:
         config: The keys ``seed``, ``model``, ``lrm``, ``preparation``, ``decomposition`` and
             ``losses`` (optional) of a configuration, as dicts, lists, numbers and strings; others
-            are ignored. Or a `Method`, whose settings are parsed already.
+            are ignored. Or a `Method`, with settings that are already parsed.
         plugins: Names of the user's modules whose classes the configuration may name.
 
     Raises:
@@ -78,22 +78,22 @@ class RadianceModule(ViewScoring):
         read = isinstance(config, Method)
         self.method = config if read else _read(config, plugins)
         plain = config.plain() if read else config
-        # Not the plug-ins: a file from somebody else must not choose what is imported.
+        # Without plug-ins: a file from somebody else must not choose what is imported.
         kept = {name: plain[name] for name in Method.GROUPS if name in plain}
         self.save_hyperparameters({"config": kept})
         self._plugins = tuple(plugins)
         self.ray_settings: BatchSettings = self.method.model.rays
-        """Sizes of training batches; once the field is built, those for its device."""
+        """Sizes of training batches; adapted to the device once the field is built."""
         self.batches = 0
-        """Batches that training has drawn."""
+        """Number of batches drawn so far."""
         self.rays = 0
-        """Rays of the next batch; 0 for whole views."""
+        """Number of rays in the next batch; 0 for whole views."""
         self.restarts = 0
-        """How often the field was initialised again, see `restart`."""
+        """How often the field was re-initialised, see `restart`."""
         self.advice: str | None = None
-        """What to change when the loss is not finite; the model's own advice when None."""
+        """Advice if the loss is not finite; the model's own when None."""
         self.between_updates = True
-        """Whether all gradients so far are applied (see ``accumulate_grad_batches``)."""
+        """Whether no accumulated gradients are pending (see ``accumulate_grad_batches``)."""
         self.scores = []
         self.tally = Tally()
         self._parts: Parts | None = None
@@ -157,9 +157,9 @@ class RadianceModule(ViewScoring):
         data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
         if data is None:
             raise ConfigError(
-                "a RadianceModule trains with a SceneDataModule: hand one over as datamodule="
+                "a RadianceModule trains with a SceneDataModule: pass one as datamodule="
             )
-        with torch.device("cpu"):  # Lightning would make every tensor on the GPU.
+        with torch.device("cpu"):  # Lightning would create every tensor on the GPU.
             self.build(
                 data.scene,
                 half_side=data.settings.half_side,
@@ -193,10 +193,10 @@ class RadianceModule(ViewScoring):
 
     @property
     def parts(self) -> Parts:
-        """What was built.
+        """The field with its model and sampler.
 
         Raises:
-            ConfigError: Before that.
+            ConfigError: If they are not built yet.
         """
         if self._parts is None:
             raise ConfigError(
@@ -211,17 +211,17 @@ class RadianceModule(ViewScoring):
 
     @property
     def sampler(self) -> Sampler:
-        """What renders training batches."""
+        """The sampler, which renders training batches."""
         return self.parts.sampler
 
     @property
     def site(self) -> Site:
-        """What the field was built for."""
+        """Context for which the field was built."""
         return self.parts.site
 
     @property
     def initialisation(self) -> Initialisation | None:
-        """Where the initial values came from; None if they were loaded."""
+        """The initialisation; None if the field was loaded."""
         return self.parts.initialisation
 
     @property
@@ -240,9 +240,9 @@ class RadianceModule(ViewScoring):
 
     @property
     def _ddp_params_and_buffers_to_ignore(self) -> list[str]:
-        """Buffers that DDP does not send from the first process to all others before each step.
+        """Buffers that DDP does not broadcast from the first process before each step.
 
-        The occupancy grid is 20 MB; processes agree on it now and then.
+        The occupancy grid has 20 MB; the processes synchronise it at intervals.
         """
         parts = self.sampler.parts.items()
         return [f"{name}.{key}" for name, part in parts for key, _ in part.named_buffers()]
@@ -251,7 +251,7 @@ class RadianceModule(ViewScoring):
 
     @property
     def progress(self) -> float:
-        """Share of training that is done: of its steps, or of a budget that a callback counts."""
+        """Share of training that is done, in steps or by a callback's budget."""
         share = self.global_step / self._steps
         return min(1.0, max([share, *(callback.progress for callback in self._schedules)]))
 
@@ -263,12 +263,12 @@ class RadianceModule(ViewScoring):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups = [*self.model.groups(), *self.sampler.groups()]
-        # Kept outside the optimiser, whose state a resumed run restores: settings may change.
+        # Not read from the optimiser's state: a resumed run restores it, but may change settings.
         self._peaks = [group["lr"] for group in groups]
         return self.model.optimizer(groups)
 
     def on_fit_start(self) -> None:
-        # Callbacks ask for `progress` in their on_train_start, which is before this module's.
+        # Not in on_train_start, because callbacks read `progress` in theirs, which run earlier.
         trainer = self.trainer
         self._steps = max(1, trainer.estimated_stepping_batches)
         callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
@@ -301,7 +301,7 @@ class RadianceModule(ViewScoring):
         self._count(rendering, batch, loss)
         log_terms(self, terms, state)
         if self.trainer.world_size > 1:
-            # DDP waits for the gradient of every parameter, also of one that no ray reached.
+            # DDP waits for the gradients of all parameters, including those that no ray reached.
             loss = loss + 0 * sum(p.sum() for p in self.parameters() if p.requires_grad)
         return loss
 
@@ -316,7 +316,7 @@ class RadianceModule(ViewScoring):
         broken = broken_flag(self.parameters(), self._losses)
         self._losses = []
         if self.trainer.world_size > 1:
-            # All processes must skip a step together, for their planes must stay equal.
+            # All processes must skip the same steps, so that their planes stay equal.
             torch.distributed.all_reduce(broken, op=torch.distributed.ReduceOp.MAX)
         named = self.named_parameters() if broken.device.type == "cpu" and broken else ()
         unusable = unusable_gradients(named)
@@ -334,17 +334,17 @@ class RadianceModule(ViewScoring):
     ) -> None:
         state = self.state
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
-        # Here and not after the batch: a checkpoint that a callback writes must hold it.
+        # Here rather than after the batch, so that checkpoints of callbacks contain the update.
         self.sampler.update(self.field, state)
         self.between_updates = True
-        self._seen = None  # A model may replace parameters that its graph refers to.
+        self._seen = None  # Its graph would keep parameters alive that a model replaces.
 
     def on_train_end(self) -> None:
         self._read_tally()
 
     def _count(self, rendering: Rendering, rays: Batch, loss: Tensor) -> None:
-        """Record the statistics of a batch; on a GPU the host reads them later."""
-        # With a learnt background, no pixel is known to be opaque or empty.
+        """Add the statistics of a batch; the host reads them later."""
+        # With a learnt background it is unknown which pixels are opaque or empty.
         known = getattr(self.field, "background", None) is None
         if known and self.batches % OPACITIES == 0:
             self.tally.opacities = mean_opacities(rendering, rays)
@@ -355,11 +355,11 @@ class RadianceModule(ViewScoring):
                 self._give_up()
 
     def _read_tally(self) -> None:
-        """Read the statistics since the last read, and set the number of rays that fits."""
+        """Read the statistics, and adapt the number of rays to the budget of samples."""
         if (found := self.tally.read(self.trainer)) is None:
             return
         rays, samples = found
-        # Samples of a batch with as many rays as the next one.
+        # Expected number of samples in the next batch.
         self.sampler.expect(samples * self.rays / max(1, rays))
         if self.rays:
             self.rays = self.ray_settings.fitting(rays, samples)
@@ -370,13 +370,13 @@ class RadianceModule(ViewScoring):
 
     @property
     def can_restart(self) -> bool:
-        """Whether the model has settings that help a field that shows nothing."""
+        """Whether the model has settings for a restart after a collapse."""
         return self.parts.settings.stronger() is not None
 
     def restart(self) -> None:
-        """Initialise the field again, with another seed and the model's stronger settings.
+        """Re-initialise the field, with another seed and the model's settings for a restart.
 
-        For one process that trains; steps and budget go on.
+        Only for a single process, during training; step count and budget continue.
         """
         device, optimizer = self.device, self._optimizer
         self._adopt(self.parts.stronger())
@@ -422,7 +422,7 @@ class RadianceModule(ViewScoring):
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
-        """As torch does, with a clear error for a state of other settings.
+        """As in torch, with a clear error for the state of a run with other settings.
 
         Raises:
             ConfigError: If it does not fit.
@@ -432,8 +432,8 @@ class RadianceModule(ViewScoring):
         except RuntimeError as error:
             problem = str(error).splitlines()[-1].strip().rstrip(".")
             raise ConfigError(
-                f"the checkpoint does not fit these settings ({problem}): continue with those that "
-                "the run began with, or start a new run in another folder"
+                f"the checkpoint does not fit these settings ({problem}): resume with the settings "
+                "that the run began with, or start a new run in another folder"
             ) from error
 
 

@@ -1,4 +1,4 @@
-"""The run directory: who may write it, run.json, config.yaml and train.log."""
+"""The run directory: which process may write it, run.json, config.yaml and train.log."""
 
 import logging
 import os
@@ -30,26 +30,26 @@ KEPT = """model.name lrm.name model.sampler.name data.name data.scene data.seed 
 data.views data.train_views data.train_on_video data.static data.half_side data.eval_split
 data.eval_every data.test_cameras data.frames data.protocol data.masks data.mask_use data.model
 data.images data.orient data.times data.time_pattern""".split()
-"""Settings on which the planes, their frame and what they show depend; not where files lie."""
+"""Settings that determine the planes, their frame and their content; paths do not count."""
 
 
 def require_same_views(run: Path, record: Mapping[str, Any], views: Views) -> None:
-    """Refuse other training views than the run's: the frame and the field's size depend on them.
+    """Refuse to resume with other training views: the frame and the field's size depend on them.
 
     Args:
         run: The run directory.
-        record: The content of its run.json; one that lists no files refuses nothing.
+        record: The content of its run.json; without a list of files, nothing is checked.
         views: The scene's training views.
 
     Raises:
-        ConfigError: If they are others, or in another order.
+        ConfigError: If the views or their order differ.
     """
     files = record.get("files")
     recorded = files.get("train") if isinstance(files, Mapping) else None
     if isinstance(recorded, list) and recorded != list(views.files):
         raise ConfigError(
-            f"{run} was trained on {len(recorded)} views, but the scene now lists "
-            f"{len(views.files)} others or in another order: restore the scene's files"
+            f"{run} was trained on {len(recorded)} views, but the scene now has {len(views.files)} "
+            f"views that differ from them in file or order: restore the scene's files"
         )
 
 
@@ -58,7 +58,7 @@ Status = Literal["running", "finished", "failed", "interrupted"]
 _PACKAGES = "torch lightning hydra-core omegaconf torchmetrics tensorboard numba triton".split()
 
 NOTED = ("device", "precision", "files")
-"""Facts that are noted once the scene is read."""
+"""Entries that are added once the scene is read."""
 
 
 class RunRecord:
@@ -67,8 +67,8 @@ class RunRecord:
     Args:
         run: The run directory.
         seed: The run's seed.
-        resume: Whether the run goes on; otherwise the record of an earlier run is ignored.
-        began: When it began, as `time.perf_counter` counts; now when None.
+        resume: Whether the run is resumed; otherwise the record of an earlier run is ignored.
+        began: Start of the run on the clock of `time.perf_counter`; now when None.
     """
 
     def __init__(self, run: Path, seed: int, *, resume: bool, began: float | None = None) -> None:
@@ -84,7 +84,7 @@ class RunRecord:
             "resumed": earlier.get("resumed", 0) + bool(earlier),
             "seed": seed,
             "process": os.getpid(),
-            "directory": str(Path.cwd()),  # Where relative paths of the settings start.
+            "directory": str(Path.cwd()),  # Relative paths of the settings start here.
             "xplanes": __version__,
             "commit": _commit(),
             "python": platform.python_version(),
@@ -96,31 +96,31 @@ class RunRecord:
         write_json(self.path, self.content)
 
     def note(self, **entries: Any) -> None:
-        """Add facts, such as the device."""
+        """Add entries, such as the device."""
         self.content.update(entries)
         write_json(self.path, self.content)
 
     def end(self, status: Status, reason: str | None = None) -> None:
-        """Set how the run ended."""
+        """Set the final status of the run."""
         total = round(self.total_seconds, 3)
         self.note(status=status, ended=_now(), total_seconds=total, reason=reason)
 
     @property
     def total_seconds(self) -> float:
-        """Wall time of this run so far, earlier parts included."""
+        """Wall-clock time of this run so far, including parts before a resume."""
         return self._before + self.seconds
 
     @property
     def seconds(self) -> float:
-        """Wall time since this part of the run began."""
+        """Wall-clock time since this part of the run began."""
         return time.perf_counter() - self._began
 
 
 def claim(run: Path, *, resume: bool) -> None:
-    """Refuse a folder that holds a run with a checkpoint, unless it is to be resumed.
+    """Refuse a folder that contains a run with a checkpoint, unless it is to be resumed.
 
     Raises:
-        ConfigError: If there is a run and ``resume`` is off, or none and it is on.
+        ConfigError: If there is a run and ``resume`` is false, or no run and it is true.
     """
     path, status = run / "run.json", None
     if path.is_file():
@@ -129,21 +129,21 @@ def claim(run: Path, *, resume: bool) -> None:
         except ValueError:
             status = "damaged"
     if not resume and not has_checkpoint(run) and status != "finished":
-        return  # It ended before its first checkpoint: nothing would be lost.
+        return  # The run ended before its first checkpoint: nothing is lost.
     if status is not None and not resume:
         raise ConfigError(
-            f"{run} holds a run already ({status}). Go on with it: {resume_command(run)}; "
+            f"{run} holds a run already ({status}). Resume it with {resume_command(run)}, "
             "or choose another hydra.run.dir"
         )
     if status is None and resume:
         raise ConfigError(
-            f"resume={run}: no run.json there, so no run to go on with; start it with "
+            f"resume={run}: there is no run.json, hence no run to resume; start one with "
             f"hydra.run.dir={run} instead of resume"
         )
 
 
 def _earlier(path: Path) -> dict[str, Any]:
-    """run.json of the run that goes on; nothing where there is none or it is damaged."""
+    """run.json of the run that is resumed; empty if it is missing or damaged."""
     if not path.is_file():
         return {}
     try:
@@ -164,9 +164,9 @@ def _version(name: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """Commit of the source tree, with a mark if it was changed; None outside a checkout."""
+    """Commit of the source tree, marked if there are local changes; None outside a checkout."""
     root = Path(__file__).resolve().parent.parent.parent
-    # Installed into an environment, the package may lie in a repository of the user's own.
+    # An installed package may lie inside a repository of the user.
     if not (root / ".git").exists():
         return None
     command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
@@ -201,14 +201,14 @@ def require_same_run(run: Path, config: Mapping[str, Any], max_steps: int) -> No
 
     Args:
         run: The run directory.
-        config: The settings that it is to go on with.
-        max_steps: Steps after which training is to end; -1 for no limit.
+        config: The new settings.
+        max_steps: New maximum number of steps; -1 for no limit.
 
     Raises:
-        ConfigError: Saying what differs, or how many steps are done.
+        ConfigError: With the difference, or the number of steps done.
     """
     before: dict[str, Any] = {}
-    with suppress(ConfigError):  # What is damaged is written again.
+    with suppress(ConfigError):  # A damaged file is written again.
         before = flatten(read_config(run))
     now = flatten(config)
     for key in KEPT:
@@ -219,18 +219,18 @@ def require_same_run(run: Path, config: Mapping[str, Any], max_steps: int) -> No
                 "Leave it out, or start a new run in another folder"
             )
     done = 0
-    with suppress(ConfigError, KeyError):  # What does not fit is refused later.
+    with suppress(ConfigError, KeyError):  # An unusable checkpoint is refused later.
         done = load_checkpoint(run / "checkpoints" / LAST)["global_step"]
     if 0 <= max_steps < done:
         raise ConfigError(
-            f"trainer.max_steps={max_steps}: {run} has done {done} steps already. Give more, or "
+            f"trainer.max_steps={max_steps}: {run} has done {done} steps already. Set more, or "
             "leave it out"
         )
 
 
 @contextmanager
 def keeping_settings(run: Path, config: Mapping[str, Any], overrides: list[str]) -> Iterator[None]:
-    """Write the settings; the earlier ones are restored if the new ones turn out to be invalid."""
+    """Write the settings; the previous ones are restored if the new ones prove invalid."""
     paths = (run / "config.yaml", run / "overrides.txt")
     before = {path: path.read_bytes() for path in paths if path.is_file()}
     write_text(paths[0], yaml.safe_dump(dict(config), sort_keys=False))
@@ -246,7 +246,7 @@ def keeping_settings(run: Path, config: Mapping[str, Any], overrides: list[str])
 
 @contextmanager
 def logged(path: Path) -> Iterator[None]:
-    """Send log records and warnings to a file, our own warnings to the terminal too."""
+    """Send log records and warnings to a file, and this package's warnings also to the terminal."""
     file, terminal = _LogFile(path), logging.StreamHandler()
     file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     terminal.setFormatter(logging.Formatter("warning: %(message)s"))
@@ -268,14 +268,14 @@ def logged(path: Path) -> Iterator[None]:
 
 
 class _LogFile(logging.FileHandler):
-    """A log that ends silently when the disk is full."""
+    """A log file that fails silently when the disk is full."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
         return
 
 
 def _own_warning(record: logging.LogRecord) -> bool:
-    """Whether a record is a warning of this package; Python's name the file they come from."""
+    """Whether a record is a warning of this package; Python's warnings begin with their file."""
     ours = record.name.startswith("xplanes") or (
         record.name == "py.warnings" and f"{Path(xplanes.__file__).parent}" in record.getMessage()
     )

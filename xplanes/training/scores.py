@@ -20,10 +20,10 @@ from xplanes.scenes.views import Views
 from xplanes.training.meters import Tally
 
 VISIBLE = 0.05
-"""Opacity above which a background pixel shows a floater."""
+"""Opacity above which a background pixel counts as a floater."""
 
 SOLID = 128
-"""Least coverage of a pixel, of 255, by the foreground object for the pixel to count."""
+"""Coverage by the foreground object, out of 255, from which a pixel counts as foreground."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class ViewScore:
         time: Its time, from 0 to 1.
         psnr: In dB.
         ssim: Structural similarity.
-        psnr_foreground: In dB, over the pixels of the foreground object; NaN where not known.
+        psnr_foreground: In dB, over the pixels of the foreground object; NaN if unknown.
         floaters: Share of background pixels (alpha 0 in the true image) that are not transparent;
-            NaN where the image has none.
+            NaN if the image has none.
     """
 
     file: str
@@ -49,7 +49,7 @@ class ViewScore:
 
     @property
     def scores(self) -> dict[str, float]:
-        """The numbers by name, those that are known."""
+        """Scores by name, without unknown ones."""
         found = {"psnr": self.psnr, "ssim": self.ssim}
         maybe = {"psnr_foreground": self.psnr_foreground, "floaters": self.floaters}
         return found | {name: value for name, value in maybe.items() if not math.isnan(value)}
@@ -58,13 +58,13 @@ class ViewScore:
 def render_item(
     field: Representation, renderer: Renderer, frame: Frame, item: Mapping[str, Any]
 ) -> dict[str, Tensor]:
-    """Render a view whole: ``colour`` [h, w, 3], ``opacity`` and ``depth`` [h, w], on the CPU.
+    """Render a whole view: ``colour`` [h, w, 3], ``opacity`` and ``depth`` [h, w], on the CPU.
 
     Args:
         field: The field.
-        renderer: Renders it.
+        renderer: The renderer.
         frame: The field's frame.
-        item: What `whole_view` gives.
+        item: Result of `whole_view`.
     """
     background: Tensor = item["background"].cpu()
     image = renderer.view(field, frame, item["camera"], float(item["time"]), background)
@@ -101,10 +101,10 @@ def score_view(
     index: int,
     background: Tensor,
 ) -> tuple[ViewScore, dict[str, Tensor]]:
-    """Render one of some views in front of ``background`` [3], and compare it with the truth.
+    """Render one of the views in front of ``background`` [3], and compare it with the true image.
 
     Returns:
-        Its score, and its images as `render_item` gives them, with ``truth`` [H, W, 3].
+        Its score, and its images as in `render_item`, with ``truth`` [H, W, 3].
     """
     item = whole_view(views, index, background)
     image = render_item(field, renderer, frame, item)
@@ -112,9 +112,9 @@ def score_view(
 
 
 def gathered(scores: Sequence[ViewScore], trainer: Trainer) -> list[ViewScore]:
-    """The scores of all processes, each of which scores every n-th view, in order.
+    """The scores of all processes in the order of the views; each scores every n-th view.
 
-    A process that has no view scores one of another process, which counts once.
+    A process without a view repeats a view of another process; duplicates count once.
     """
     if trainer.world_size == 1:
         return list(scores)
@@ -126,12 +126,12 @@ def gathered(scores: Sequence[ViewScore], trainer: Trainer) -> list[ViewScore]:
 
 
 def psnr_foreground(colour: Tensor, truth: Tensor, foreground: Tensor | None) -> float:
-    """PSNR in dB of the pixels that show the foreground object; NaN where there are none.
+    """PSNR in dB of the pixels that show the foreground object; NaN if there are none.
 
     Args:
         colour: Rendered colours. [H, W, 3]
         truth: True colours. [H, W, 3]
-        foreground: Share of each pixel that shows the object; None where not known. uint8 [H, W]
+        foreground: Coverage of each pixel by the object; None if unknown. uint8 [H, W]
     """
     if foreground is None or not (shown := foreground.cpu() >= SOLID).any():
         return math.nan
@@ -147,13 +147,13 @@ def floaters(opacity: Tensor, alpha: Tensor) -> float:
 
 
 def mean_scores(scores: Sequence[ViewScore]) -> dict[str, float]:
-    """Means over views of each score that any of them has."""
+    """Mean of each score over the views that have it."""
     names = dict.fromkeys(name for score in scores for name in score.scores)
     return {name: mean([s.scores[name] for s in scores if name in s.scores]) for name in names}
 
 
 def mean_colour(views: Views, background: Tensor) -> Tensor:
-    """Mean over images in front of ``background`` [3] of their mean colour. [3]"""
+    """Mean colour of all images, composited on ``background`` [3]. [3]"""
     images = (views.composite(index, background) for index in range(len(views)))
     return torch.stack([image.flatten(0, 1).mean(dim=0) for image in images]).mean(dim=0)
 
@@ -173,9 +173,9 @@ class ViewScoring(LightningModule):
     """Scores whole views, as `SceneDataModule` serves them, in validation and test.
 
     Attributes:
-        field: What is rendered.
-        tally: Takes the means over views.
-        scores: Those of the views of the last validation or test, of all processes.
+        field: The field that is rendered.
+        tally: Receives the means over views.
+        scores: Scores of the views of the last validation or test, from all processes.
     """
 
     field: Representation
@@ -205,7 +205,7 @@ class ViewScoring(LightningModule):
         return render_item(self.field, self.renderer, frame, batch)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
-        """The rendered view; its scores wait for those of the others."""
+        """The rendered view; its scores are logged at the end, with those of the others."""
         image = self.predict_step(batch, batch_idx)
         self.scores.append(score_image(image, batch))
         self._tag = batch["tag"]
@@ -225,17 +225,17 @@ class ViewScoring(LightningModule):
         means = {f"{tag}/{name}": value for name, value in mean_scores(self.scores).items()}
         self.tally.last |= means
         if self.trainer.state.fn == TrainerFn.FITTING:
-            # Lightning's own count is one less, and not that of a run that goes on.
+            # Lightning's own count is one less, and does not continue in a resumed run.
             means["step"] = float(self.trainer.global_step)
-        # All processes have the means of all views; Lightning warns where it need not.
+        # All processes already have the means of all views; sync_dist avoids Lightning's warning.
         self.log_dict(means, batch_size=1, sync_dist=self.trainer.world_size > 1)
 
     on_test_epoch_end = on_validation_epoch_end
 
     def agree(self) -> None:
-        """Copy the first process's sampler to all, each of which saw its own rays alone.
+        """Copy the first process's sampler to all: each has observed only its own rays.
 
-        What is scored, or goes into a checkpoint, is one field.
+        All processes then score and save the same field.
         """
         if self._trainer is None or self._trainer.world_size == 1:
             return

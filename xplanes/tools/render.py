@@ -232,7 +232,7 @@ def destination(
 def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> list[PosedCamera]:
     """The camera of each frame.
 
-    A view's camera keeps its lens and principal point; orbits use the training views' field of view.
+    A view's camera keeps its distortion and principal point. An orbit has the views' field of view.
     """
     rows, columns = options.shape(splits)
     if (path := options.cameras) is not None:

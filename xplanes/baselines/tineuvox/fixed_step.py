@@ -187,7 +187,7 @@ class FixedStepSampler(Sampler):
     """Places samples at fixed steps, without jitter; it has no state to update.
 
     Args:
-        renderer: Places them.
+        renderer: The renderer.
     """
 
     def __init__(self, renderer: FixedStepRenderer) -> None:

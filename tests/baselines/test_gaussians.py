@@ -437,7 +437,7 @@ def test_what_does_not_fit_is_refused(tmp_path, scenes):
     field = gaussians(3)
     with pytest.raises(ConfigError, match=r"--what mesh: .* set --what gaussians"):
         export(trained(field), ExportOptions("mesh", times="2"), tmp_path / "a", say=print)
-    with pytest.raises(ConfigError, match="frame is turned"):
+    with pytest.raises(ConfigError, match="frame is rotated"):
         field.exports["gaussians"](tmp_path / "b", 0.0, TURNED)
     with pytest.raises(ConfigError, match=r"--what video: .* has none; set --what .*gaussians"):
         export(trained(field), ExportOptions("video"), tmp_path / "b", say=print)

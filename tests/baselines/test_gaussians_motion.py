@@ -205,7 +205,7 @@ def test_first_points_lie_on_what_a_field_shows(tmp_path, monkeypatch):
     monkeypatch.setattr(points, "ROUNDS", 1)
     monkeypatch.setattr(points, "OPAQUE", 2.0)
     early = RadianceModule(config | {"lrm": config["lrm"] | {"steps": 1}})
-    with pytest.raises(ConfigError, match=r"lrm\.steps=1: six_planes shows nothing yet"):
+    with pytest.raises(ConfigError, match=r"lrm\.steps=1: six_planes has no surfaces"):
         early.build(scene, frame, say=said.append)
 
 

@@ -73,7 +73,7 @@ def test_settings_that_do_not_go_together_are_refused(scenes):
         ("model.sampler.near=7", r"model\.sampler\.near=7\.0: must be below far=6\.0"),
         (
             "model.sampler.resolutions=[64]",
-            r"model\.sampler\..* with resolutions=\[64\]: one number for each density field",
+            r"model\.sampler\..* with resolutions=\[64\]: both need one number per density field",
         ),
         ("model.scales=[]", r"model\.scales=\[\]: must be one or more numbers above 0"),
         ("model.space_low=0.9", r"model\.space_low=0\.9: must not be above space_high=0\.5"),

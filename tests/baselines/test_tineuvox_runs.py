@@ -59,7 +59,7 @@ def test_settings_that_cannot_work_are_refused(scenes):
     ):
         check_refused(scenes, words, "model=tineuvox_s", override)
     # Samplers that need two stages refuse other models.
-    words = r"model\.sampler\.name=fixed_step: needs a field of cells.* model/sampler=occupancy"
+    words = r"model\.sampler\.name=fixed_step: needs a feature grid.* model/sampler=occupancy"
     check_refused(scenes, words, "model/sampler=fixed_step")
     words = r"model\.sampler\.name=neus: needs a field with a surface.* model/sampler=occupancy"
     for model in ("six_planes", "tineuvox_s"):

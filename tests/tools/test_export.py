@@ -393,7 +393,7 @@ def test_bad_options_are_refused(tmp_path):
 
 def test_exports_that_cannot_be_are_refused(tmp_path):
     trained, out = set_up(tmp_path, Ball(density=0.1)), tmp_path / "out"
-    with pytest.raises(ConfigError, match="stops half of the light in no pixel"):
+    with pytest.raises(ConfigError, match="no pixel of the training cameras has an opacity"):
         export(trained, ExportOptions(resolution=16), out, say=quiet)
     with pytest.raises(ConfigError, match=r"nowhere above the threshold 5; the largest is 0\.1"):
         export(trained, ExportOptions(resolution=16, threshold=5.0), out, say=quiet)

@@ -131,7 +131,7 @@ def test_options_out_of_range_are_refused():
     refused = {
         VideoOptions(path="spiral"): "--path spiral",
         VideoOptions(time="2"): "--time 2",
-        VideoOptions(time="own"): "--time own: only the camera of a view",
+        VideoOptions(time="own"): "--time own: is a view's own time and needs --path view:FILE",
         VideoOptions(frames=0): "--frames 0",
         VideoOptions(fps=0): "--fps 0",
         VideoOptions(size=-4): "--size -4",

@@ -109,7 +109,7 @@ def test_a_film_shows_a_step_after_the_other_beside_the_truth(tmp_path):
 
 def test_parts_are_shown_whole(tmp_path):
     run = pictured(tmp_path / "0")
-    with pytest.raises(ConfigError, match=r"no run has media/decomposition\.png: only runs that"):
+    with pytest.raises(ConfigError, match=r"no run has media/decomposition\.png: only runs"):
         write_sheet(tmp_path, what="parts")
     Image.new("RGB", (60, 30), (1, 2, 3)).save(run / "media" / "decomposition.png")
     assert areas(write_sheet(tmp_path, what="parts")) == {(1, 2, 3): 60 * 30}

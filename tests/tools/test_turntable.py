@@ -106,7 +106,7 @@ def test_settings_that_make_no_triplanes_are_refused(tmp_path, pictures):
 def test_missing_images_are_named(tmp_path):
     with pytest.raises(SceneError, match="absent"):
         find_pictures([tmp_path / "absent.png"])
-    with pytest.raises(SceneError, match="holds no pictures"):
+    with pytest.raises(SceneError, match="contains no images"):
         find_pictures([tmp_path])
     with pytest.raises(SceneError, match="at least one"):
         find_pictures([])

@@ -1,4 +1,4 @@
-"""Small networks, encodings of their inputs, and an activation of density."""
+"""Small networks, encodings of their inputs, and an activation function for density."""
 
 import math
 from collections.abc import Sequence
@@ -16,8 +16,8 @@ def octaves(values: Tensor, count: int) -> Tensor:
     """The values, then their sines and cosines at ``count`` frequencies 1, 2, 4, ...
 
     Args:
-        values: What to encode. [N, D]
-        count: Number of frequencies; 0 leaves the values alone.
+        values: Values to encode. [N, D]
+        count: Number of frequencies; 0 returns the values unchanged.
 
     Returns:
         Values, then sines and cosines, frequency by frequency. [N, D (1 + 2 count)]
@@ -37,7 +37,7 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
         directions: Unit vectors. [N, 3]
 
     Returns:
-        Degree by degree, order from -l to l. [N, 16]
+        Harmonics by degree l, then by order from -l to l. [N, 16]
     """
     x, y, z = directions.unbind(dim=-1)
     xx, yy, zz = x * x, y * y, z * z
@@ -69,23 +69,22 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
 
 
 BLOCK = 16
-"""Widths are padded to multiples of it, as fused GPU networks need."""
+"""Widths are padded to multiples of this number, as in fully fused GPU networks."""
 
 STEEPEST = 15.0
-"""Logits beyond it get the gradient of this one."""
+"""Bound on the absolute value of logits in the gradient of `truncated_exponential`."""
 
 
 class PaddedMLP(nn.Module):
-    """Linear layers without biases; ones fill up the input to a multiple of 16 columns.
+    """Linear layers without biases; the input is padded with ones to a multiple of 16 columns.
 
-    The padding is trained like any weight: P columns of ones act as one bias whose learning rate is
-    P times as high. Weights are initialised with Glorot's uniform distribution, for widths rounded
-    up to multiples of 16.
+    Weights of the padding are trained: P columns of ones act as a bias with P times the learning
+    rate. Weights have Glorot's uniform initialisation, for widths rounded up to multiples of 16.
 
     Args:
         widths: Columns of the input, neurons of each hidden layer, columns of the output.
-        activation: Whether a ReLU stands between layers.
-        precision: "bf16" multiplies in bfloat16.
+        activation: Whether there is a ReLU between layers.
+        precision: "bf16" for matrix products in bfloat16.
 
     Source: tiny-cuda-nn's fully fused network, as K-Planes uses it.
     """
@@ -136,7 +135,7 @@ class _TruncatedExponential(torch.autograd.Function):
 
 
 def truncated_exponential(logits: Tensor) -> Tensor:
-    """The exponential, with a gradient that stays finite. [...] -> [...]
+    """The exponential, with a bounded gradient. [...] -> [...]
 
     Source: Instant-NGP; K-Planes.
     """

@@ -1,4 +1,4 @@
-"""Products of feature planes at several scales, what K-Planes reads from, and their smoothness."""
+"""Products of feature planes at several scales, as in K-Planes, and their regularisers."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ from xplanes.fields.regularisers import (
 AXES = "xyzt"
 
 BLOCK = 2048
-"""Points whose intermediate gradients lie in the cache together."""
+"""Points per block, so that intermediate gradients fit in the cache."""
 
 DYNAMIC = ("xy", "xz", "xt", "yz", "yt", "zt")
 STATIC = ("xy", "xz", "yz")
@@ -29,17 +29,16 @@ STATIC = ("xy", "xz", "yz")
 
 
 class PlaneProducts(nn.Module):
-    """At each scale the product of all planes, channel by channel.
+    """Multiplies all planes of each scale, channel by channel.
 
     Plane "ab" has axis a along its columns, b along its rows. Coordinates from -1 to 1 run from the
-    first texel's centre to the last one's (``align_corners=True``); what lies beyond takes the
-    value at the border.
+    first texel's centre to the last one's (``align_corners=True``) and are clamped to this range.
 
     Args:
         channels: Channels of each plane.
         resolution: Texels along each space axis at scale 1.
         scales: Factors on the resolution.
-        time_resolution: Rows of time, at every scale; None for a static scene.
+        time_resolution: Rows along time, at every scale; None for a static scene.
         low: Lower bound of the uniform initialisation of space planes. Time planes are
             initialised to 1.
         high: Upper bound of that initialisation.
@@ -68,7 +67,7 @@ class PlaneProducts(nn.Module):
                 rows = time_resolution if "t" in name else size
                 plane = torch.ones(1, channels, rows or 0, size)
                 plane = plane if "t" in name else plane.uniform_(low, high)
-                # The channels of a texel side by side: one read of memory brings them all.
+                # Channels of a texel are contiguous, for coalesced reads.
                 planes[name] = nn.Parameter(plane.contiguous(memory_format=torch.channels_last))
             self.scales.append(planes)
 
@@ -85,11 +84,11 @@ class PlaneProducts(nn.Module):
         """Features of points at times.
 
         Args:
-            points: Positions, the planes' cube being [-1, 1]^3. [N, 3]
+            points: Positions; the planes cover [-1, 1]^3. [N, 3]
             times: Times from 0 to 1. [N]
 
         Returns:
-            The scales side by side. [N, channels * scales]
+            Features of all scales, concatenated. [N, channels * scales]
         """
         places = torch.cat([points, 2 * times[:, None] - 1], dim=1)
         found = [
@@ -100,10 +99,10 @@ class PlaneProducts(nn.Module):
 
 
 def plane_product(planes: Sequence[Tensor], places: Tensor, names: Sequence[str]) -> Tensor:
-    """What planes hold at places, multiplied channel by channel.
+    """Interpolate planes and multiply the results channel by channel.
 
-    Gradients reach the planes only. On the CPU compiled loops do the work, on CUDA Triton kernels
-    where they prove themselves, elsewhere `plane_product_reference`.
+    Gradients reach the planes only. The CPU uses compiled loops, and CUDA Triton kernels if they
+    agree with `plane_product_reference`, which is used otherwise.
 
     Args:
         planes: Plane "ab" has axis a along its columns. [1, C, rows, columns] each
@@ -130,10 +129,10 @@ def plane_product(planes: Sequence[Tensor], places: Tensor, names: Sequence[str]
 def plane_product_reference(
     planes: Sequence[Tensor], places: Tensor, names: Sequence[str]
 ) -> Tensor:
-    """The same as `plane_product`, written for reading: one ``grid_sample`` per plane."""
+    """Readable version of `plane_product`: one ``grid_sample`` per plane."""
     product = torch.ones((), device=places.device)
     for plane, (column, row) in zip(planes, names, strict=True):
-        # Columns one by one: a list of numbers would be sent to the device and waited for.
+        # Indexing with a list would copy it to the device and synchronise.
         grid = torch.stack([places[:, AXES.index(axis)] for axis in (column, row)], dim=1)
         grid = grid[None, None].to(plane.dtype)
         product = product * F.grid_sample(plane, grid, padding_mode="border", align_corners=True)
@@ -141,7 +140,7 @@ def plane_product_reference(
 
 
 def plane_product_gpu(planes: Sequence[Tensor], places: Tensor, names: Sequence[str]) -> Tensor:
-    """The same as `plane_product`, in Triton kernels: one for the values, one for the gradients."""
+    """Triton version of `plane_product`: one kernel for the values, one for the gradients."""
     axes = tuple((AXES.index(column), AXES.index(row)) for column, row in names)
     return _Kernels.apply(places, axes, *planes)  # type: ignore[return-value]
 
@@ -216,11 +215,11 @@ class _Kernels(torch.autograd.Function):
 def _kernels_hold(
     device: torch.device, dtype: torch.dtype, channels: int, names: tuple[str, ...]
 ) -> bool:
-    """Whether the kernels prove themselves for such planes, gradients included."""
+    """Whether the kernels agree with the reference for such planes, gradients included."""
 
     def attempt(function: Callable[..., Tensor], precision: torch.dtype) -> list[Tensor]:
         planes = [
-            # Multiples of 16, as most real sizes are: triton makes a variant for those.
+            # Multiples of 16, as in practice: Triton specialises kernels for them.
             waves(device, 1, channels, 4 if "t" in name else 16, 16).to(dtype).to(precision)
             for name in names
         ]
@@ -239,7 +238,7 @@ def _rows(plane: Tensor) -> Tensor:
 
 
 def _array(plane: Tensor) -> Any:
-    """A plane with its channels last, for loops. [1, C, rows, columns] -> [rows, columns, C]"""
+    """A plane with its channels last, in numpy. [1, C, rows, columns] -> [rows, columns, C]"""
     return _rows(plane).numpy()
 
 
@@ -251,15 +250,15 @@ ROWS, COLUMNS = 2, 3
 
 @dataclass(frozen=True)
 class PlaneTerms:
-    """Weights of the terms.
+    """Weights of the regularisers of planes.
 
     Attributes:
-        total_variation: Of squared differences between neighbouring texels.
+        total_variation: Weight of squared differences between neighbouring texels.
         variation: ``coded`` sums twice the mean squares along rows and columns over all planes,
-            along time too, and counts space planes twice. ``corrected`` is the mean over planes of
-            half that sum for space planes, and of differences along space alone for the others.
-        time_smoothness: Of squared second differences along time, summed over planes.
-        time_identity: Of the time planes' mean distance from 1, summed over planes.
+            including time, and counts space planes twice. ``corrected`` is the mean over planes;
+            it halves the sum for space planes, and omits differences along time for time planes.
+        time_smoothness: Weight of squared second differences along time, summed over planes.
+        time_identity: Weight of the time planes' mean distance from 1, summed over planes.
 
     Source: K-Planes, released code.
     """
@@ -304,7 +303,7 @@ class PlaneTerms:
                 plane.grad.add_((plane - 1).sign(), alpha=weight / plane.numel())
 
     def _variation(self, name: str, count: int) -> tuple[tuple[int, ...], float]:
-        """Axes along which a plane's differences count, and their factor."""
+        """Axes of the differences in a plane's total variation, and its factor."""
         if self.variation == "coded":
             return (ROWS, COLUMNS), 2.0 if "t" in name else 4.0
         if "t" in name:

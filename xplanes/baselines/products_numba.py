@@ -37,7 +37,7 @@ def multiply(planes, places, axes, product):
 
 @njit(parallel=True, **COMPILE)
 def multiply_backward(planes, places, axes, gradient, spread, gradients):
-    """Gradients of `multiply`, block by block so that what is between stays in the cache."""
+    """Gradients of `multiply`, in blocks whose intermediate results fit in the cache."""
     block, count, channels = spread.shape
     for start in range(0, places.shape[0], block):
         size = min(block, places.shape[0] - start)
@@ -56,7 +56,7 @@ def multiply_backward(planes, places, axes, gradient, spread, gradients):
                         + w11 * plane[r1, c1, c]
                     )
             for c in range(channels):
-                # Each factor's gradient is the product of all others, which may hold zeros.
+                # Each factor's gradient is the product of the others; division fails at zeros.
                 before = gradient[n, c]
                 for p in range(count):
                     value = spread[i, p, c]

@@ -11,16 +11,16 @@ from xplanes.fields.lookup_triton import read, spread, tiles, time_taps
 
 @triton.jit
 def border_taps(places, n, axis, size, live):
-    """Two neighbouring texels of places from -1 to 1; what lies beyond takes the border's."""
+    """Two neighbouring texels and their weights, for coordinates clamped to [-1, 1]."""
     value = tl.load(places + 4 * n + axis, mask=live, other=0.0)
     lower, upper, first, second = time_taps((value + 1) * 0.5, size)
-    # Points that fill up the last block must touch nothing.
+    # Padding of the last block must have no effect.
     return lower, upper, tl.where(live, first, 0.0), tl.where(live, second, 0.0)
 
 
 @triton.jit
 def read_all(planes, sizes, places, n, live, channel, AXES: tl.constexpr, CHANNELS: tl.constexpr):
-    """What each plane holds, one after the other."""
+    """Interpolated features of each plane, as a tuple."""
     found = ()
     for p in tl.static_range(len(AXES)):
         column = border_taps(places, n, AXES[p][0], sizes[p][1], live)
@@ -73,7 +73,7 @@ def backward(
     upstream = tl.load(gradient + n[:, None] * CHANNELS + channel[None, :], mask=mask, other=0.0)
     values = read_all(planes, sizes, places, n, live, channel, AXES, CHANNELS)
     for p in tl.static_range(len(AXES)):
-        # Each factor's gradient is the product of all others, which may hold zeros.
+        # Each factor's gradient is the product of the others; division fails at zeros.
         source = upstream
         for q in tl.static_range(len(AXES)):
             if q != p:
@@ -84,7 +84,7 @@ def backward(
 
 
 def multiply(planes, places, axes, product):
-    """Launches `forward`: planes [rows, columns, C] each; ``product`` [N, C] is written."""
+    """Launch `forward` for planes [rows, columns, C] each, and write to ``product`` [N, C]."""
     grid, blocks = tiles(*product.shape)
     sizes = tuple(tuple(plane.shape[:2]) for plane in planes)
     with torch.cuda.device_of(product):
@@ -92,7 +92,7 @@ def multiply(planes, places, axes, product):
 
 
 def multiply_backward(planes, places, axes, gradient, gradients):
-    """Launches `backward`: ``gradients``, like ``planes``, are added to."""
+    """Launch `backward`, and add to ``gradients``, which have the shapes of ``planes``."""
     grid, blocks = tiles(*gradient.shape)
     sizes = tuple(tuple(plane.shape[:2]) for plane in planes)
     with torch.cuda.device_of(gradient):

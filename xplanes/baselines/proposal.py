@@ -1,4 +1,4 @@
-"""Samples where small density fields, trained along, expect something."""
+"""Proposal sampling: small density fields, trained jointly, place the samples."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,22 +23,22 @@ from xplanes.settings import Count, Positive, Weight
 from xplanes.streams import Stream, TrainingState, initial_values
 
 ALWAYS = 10
-"""First steps, in each of which the density fields learn."""
+"""Number of first steps, in all of which the density fields are updated."""
 
 NEAREST, FARTHEST = 0.05, 1000.0
-"""Where samples of contracted space begin and end, in units of the field's frame."""
+"""Near and far bounds for contracted space, in units of the field's frame."""
 
 SMALLEST = 1e-7
-"""Keeps the histogram term finite where the field sees nothing."""
+"""Added to the denominator of the histogram loss."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """Samples of one round.
+    """Samples of one density field or of the field.
 
     Attributes:
-        edges: Ends of the samples, from 0 at near to 1 at far, as they are spaced. [R, S + 1]
-        weights: Share of the light that each sample sends. [R, S]
+        edges: Edges of the samples' bins, from 0 at near to 1 at far. [R, S + 1]
+        weights: Compositing weights of the samples. [R, S]
     """
 
     edges: Tensor
@@ -47,27 +47,27 @@ class Level:
 
 @dataclass(frozen=True)
 class ProposalRendering(Rendering):
-    """What rays see, and what the density fields expected.
+    """A rendering with the samples of all density fields.
 
     Attributes:
-        levels: One for each density field, gradients reach these; then the field's own, without.
+        levels: One per density field, with gradients; then the field's own, without.
     """
 
     levels: tuple[Level, ...]
 
 
 class ProposalRenderer(RayRenderer):
-    """Samples equal bins in the first density field, then in each next one where the last saw most.
+    """Samples the first density field uniformly, then each next field by the previous weights.
 
     Args:
         proposals: Density fields: from points [N, 3] and times [N] to density [N].
-        counts: Samples of a ray in each of them.
-        samples: Samples of a ray in the field.
-        near: Distance at which samples begin, in the field's frame; None where rays enter the cube.
-        far: Distance at which they end; None where rays leave the cube.
-        padding: As for `resample`.
-        contracted: Sample all of space: evenly up to a distance of 1, evenly in inverse distance
-            beyond.
+        counts: Samples per ray in each density field.
+        samples: Samples per ray in the field.
+        near: Near bound in the field's frame; None for the distance at which rays enter the cube.
+        far: Far bound; None for the distance at which rays leave the cube.
+        padding: See `resample`.
+        contracted: Whether to sample all of space: uniformly in distance up to 1, uniformly in
+            inverse distance beyond.
 
     Source: K-Planes, released code; Mip-NeRF 360, Section 3.
     """
@@ -88,12 +88,12 @@ class ProposalRenderer(RayRenderer):
         self.proposals, self.counts, self.samples = proposals, tuple(counts), samples
         self.contracted = contracted
         self.near, self.far, self.padding = near, far, padding
-        # With the density fields it goes into checkpoints, and to their device.
+        # As a buffer of the density fields it is saved in checkpoints and moved to their device.
         proposals.register_buffer("exponent", torch.ones(()))
 
     @property
     def exponent(self) -> Tensor:
-        """Exponent of the weights before samples are drawn; training sets it. []"""
+        """Exponent of the weights for resampling; training anneals it. []"""
         return self.proposals.get_buffer("exponent")
 
     @property
@@ -114,17 +114,17 @@ class ProposalRenderer(RayRenderer):
         """Render rays.
 
         Args:
-            field: From points, times and, if it is ``view_dependent``, directions to colour and
+            field: Field from points, times and, if ``view_dependent``, directions to colour and
                 density.
             origins: Ray origins in the field's frame. [R, 3]
             directions: Unit directions. [R, 3]
             times: Time of each ray, from 0 to 1. [R]
-            background: Colour behind the scene. [3] or [R, 3]
-            jitter: Moves all samples; None leaves them where they are.
+            background: Background colour. [3] or [R, 3]
+            jitter: Generator of random numbers for stratified sampling; None for no jitter.
             learn: Whether gradients reach the density fields.
 
         Returns:
-            One value per ray; gradients reach the field.
+            The rendering; gradients reach the field.
         """
         near, far = self._range(origins, directions)
         place = _Rays(origins, directions, near, far, self.contracted)
@@ -199,7 +199,7 @@ class _Rays:
 
 
 def spaced(distances: Tensor) -> Tensor:
-    """Distances as numbers from 0 to 1 that are even in distance, then in its inverse. [...]
+    """Map distances to [0, 1): linear up to a distance of 1, linear in its inverse beyond. [...]
 
     Source: K-Planes, released code.
     """
@@ -212,7 +212,7 @@ def unspaced(places: Tensor) -> Tensor:
 
 
 def dense_samples(points: Tensor, distances: Tensor) -> Samples:
-    """Equally many samples on each ray, none of them dropped. [R S, 3], [R, S]"""
+    """`Samples` with equally many per ray, none of them dropped. [R S, 3], [R, S]"""
     rays, count = distances.shape
     index = torch.arange(rays, device=distances.device)
     return Samples(
@@ -263,7 +263,7 @@ class ProposalSettings(SamplerSettings):
         if len(self.proposal_samples) != len(self.resolutions):
             raise ConfigError(
                 f"proposal_samples={self.proposal_samples} with resolutions={self.resolutions}: "
-                "one number for each density field in both"
+                "both need one number per density field"
             )
         if (self.near is None) != (self.far is None):
             raise ConfigError(
@@ -325,10 +325,10 @@ class ProposalSettings(SamplerSettings):
 
 
 class ProposalSampler(Sampler):
-    """Samples drawn from density fields that train along.
+    """Samples drawn from density fields that are trained jointly.
 
     Args:
-        renderer: Holds the density fields.
+        renderer: Renderer with the density fields.
         settings: Schedule, weights and learning rate.
 
     Source: K-Planes, released code.
@@ -363,13 +363,13 @@ class ProposalSampler(Sampler):
         return [{"params": parameters, "lr": self.settings.learning_rate, "name": "proposals"}]
 
     def anneal(self, step: int) -> float:
-        """Exponent of the weights that samples are drawn from: from 0 to 1, fast at first."""
+        """Exponent of the weights for resampling: from 0 to 1, fast at first."""
         share = min(step / self.settings.anneal_steps, 1.0)
         slope = self.settings.anneal_slope
         return slope * share / ((slope - 1) * share + 1)
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> ProposalRendering:
-        # It stays in force for the images after this step.
+        # Validation renders after this step use the same exponent.
         self._renderer.exponent.fill_(self.anneal(state.step))
         return self._renderer.render(
             field,
@@ -403,13 +403,13 @@ class ProposalSampler(Sampler):
 
 
 class UpdateSchedule:
-    """In which steps density fields learn: all at first, then rarer, a function of the step alone.
+    """Decides at which steps density fields are updated, from the step alone.
 
-    They learn when more than n steps have passed since they last did; n grows from 1 to ``every``.
+    After `ALWAYS` steps, more than n steps pass between updates; n grows from 1 to ``every``.
 
     Args:
-        every: n in the end.
-        warmup: Steps over which it grows.
+        every: Final value of n.
+        warmup: Steps over which n grows.
     """
 
     def __init__(self, every: int, warmup: int) -> None:
@@ -417,7 +417,7 @@ class UpdateSchedule:
         self._step, self._last = -1, 0
 
     def learns(self, step: int) -> bool:
-        """Whether they learn in a step."""
+        """Whether the density fields are updated at a step."""
         if step < self._step:
             self._step, self._last = -1, 0
         while self._step < step:
@@ -429,13 +429,13 @@ class UpdateSchedule:
 
 
 def histogram_loss(levels: Sequence[Level]) -> Tensor:
-    """How far the field's weights rise above what each density field allows.
+    """The proposal loss: excess of the field's weights over the bound from each density field.
 
-    For each density field the mean over rays and samples of ``max(0, w - c)^2 / (w + 1e-7)``, w a
-    weight of the field and c the weights of all coarse samples that its sample touches.
+    For each density field it is the mean over rays and samples of ``max(0, w - c)^2 / (w + 1e-7)``,
+    with w a weight of the field and c the total weight of the coarse samples that overlap it.
 
     Args:
-        levels: Density fields, which gradients reach; then the field, which they do not.
+        levels: Levels of the density fields, with gradients; then the field's, without.
 
     Returns:
         The sum over density fields. []

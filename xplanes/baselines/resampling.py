@@ -1,4 +1,4 @@
-"""Placing samples along rays where earlier samples found something."""
+"""Importance sampling along rays from the weights of earlier samples."""
 
 import torch
 from torch import Tensor
@@ -7,25 +7,25 @@ from xplanes.rendering.compositing import OPAQUE, stopped
 
 
 def ray_weights(optical_depth: Tensor) -> Tensor:
-    """Share of the light that each sample of a ray sends, by Beer and Lambert. [R, S] -> [R, S]
+    """Compositing weights of samples from their optical depths. [R, S] -> [R, S]
 
-    The same as the weights of `composite`, for rays of equally many samples and with gradients.
+    Equal to the weights of `composite`, for equally many samples per ray, and differentiable.
     """
     depth = optical_depth.clamp(0, OPAQUE)
     return (depth - depth.cumsum(dim=1)).exp() * stopped(depth)
 
 
 def uniform_edges(rays: int, count: int, uniform: Tensor | None, device: torch.device) -> Tensor:
-    """Edges of ``count`` equal bins from 0 to 1, each moved within half a bin on either side.
+    """Edges of ``count`` equal bins from 0 to 1, jittered by up to half a bin.
 
     Args:
         rays: Number of rays R.
         count: Number of bins.
-        uniform: Numbers from 0 to 1; None leaves the bins equal. [R, count + 1]
-        device: Where to put them.
+        uniform: Random numbers from 0 to 1; None for no jitter. [R, count + 1]
+        device: Device of the edges.
 
     Returns:
-        Ascending. [R, count + 1]
+        Ascending edges. [R, count + 1]
     """
     edges = torch.linspace(0, 1, count + 1, device=device).expand(rays, -1)
     if uniform is None:
@@ -39,17 +39,17 @@ def uniform_edges(rays: int, count: int, uniform: Tensor | None, device: torch.d
 def resample(
     edges: Tensor, weights: Tensor, count: int, uniform: Tensor | None, padding: float
 ) -> Tensor:
-    """Edges of new bins that hold about equal weight each.
+    """Edges of new bins with about equal weight, by inverse transform sampling.
 
-    The weights, with ``padding`` added to each, are a density that is constant within bins; the new
-    edges are where its running integral passes equally spaced numbers.
+    The weights plus ``padding`` are a piecewise constant density; the new edges are at equally
+    spaced values of its cumulative distribution.
 
     Args:
         edges: Ascending edges of the bins. [R, S + 1]
-        weights: Weight of each bin, not below 0. [R, S]
+        weights: Weight of each bin, at least 0. [R, S]
         count: Number of new bins.
-        uniform: Numbers from 0 to 1 that move each new edge within its share; None takes the
-            middle. [R, count + 1]
+        uniform: Random numbers from 0 to 1 for stratified sampling; None for the middle of each
+            stratum. [R, count + 1]
         padding: Added to each weight; above 0.
 
     Returns:
@@ -74,15 +74,15 @@ def resample(
 
 
 def covering_weights(edges: Tensor, coarse_edges: Tensor, coarse_weights: Tensor) -> Tensor:
-    """For each bin the weight of all coarse bins that it touches.
+    """Total weight of the coarse bins that overlap each bin.
 
     Args:
-        edges: Ascending. [R, S + 1]
-        coarse_edges: Ascending. [R, P + 1]
-        coarse_weights: Gradients reach them. [R, P]
+        edges: Ascending edges of the bins. [R, S + 1]
+        coarse_edges: Ascending edges of the coarse bins. [R, P + 1]
+        coarse_weights: Weights of the coarse bins; gradients reach them. [R, P]
 
     Returns:
-        [R, S]
+        Weight for each bin. [R, S]
 
     Source: Mip-NeRF 360, Eq. 12.
     """

@@ -1,4 +1,4 @@
-"""What people do with captures and runs beside training: inspect, view, export, compare, share.
+"""Tools for captures and runs: inspecting, viewing, exporting, comparing and sharing.
 
-The core does not import it.
+The core does not import them.
 """

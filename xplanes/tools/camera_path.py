@@ -1,4 +1,4 @@
-"""Camera paths from and to JSON files: nerfstudio's, and those of transforms files."""
+"""Camera paths in JSON files: the format of nerfstudio's viewer, and transforms files."""
 
 import logging
 import math
@@ -18,7 +18,7 @@ from xplanes.scenes.views import Views
 logger = logging.getLogger(__name__)
 
 OVERSHOOT = 0.25
-"""How far times may lie beyond 0 and 1: splines through key frames overshoot."""
+"""Tolerance of times beyond 0 and 1: splines through key frames overshoot."""
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,10 @@ class CameraPath:
         poses: Camera-to-world matrices. [F, 4, 4]
         times: Time of each frame, from 0 to 1. [F]
         tangents: Tangent of half the field of view of each frame, along ``upright``. [F]
-        upright: Whether that field of view is the vertical one; the horizontal one otherwise.
-        height: Rows of a frame; None where the file does not say.
-        width: Columns of a frame; None where the file does not say.
-        fps: Frames per second; None where the file does not say.
+        upright: Whether the field of view is vertical; otherwise it is horizontal.
+        height: Rows of a frame; None if the file does not contain them.
+        width: Columns of a frame; None if the file does not contain them.
+        fps: Frames per second; None if the file does not contain it.
     """
 
     poses: Tensor
@@ -47,24 +47,24 @@ class CameraPath:
         return len(self.poses)
 
     def focal(self, height: int, width: int) -> Tensor:
-        """Focal length of each frame in pixels of frames of this size. [F]"""
+        """Focal length of each frame in pixels, for frames of the given size. [F]"""
         return 0.5 * (height if self.upright else width) / self.tangents
 
 
 def read_camera_path(path: Path) -> CameraPath:
-    """Read a camera path and check all of it.
+    """Read and check a camera path in one of two formats.
 
-    Two formats are read. ``camera_path.json`` of nerfstudio's viewer: ``camera_path``, a list of
+    ``camera_path.json`` of nerfstudio's viewer has ``camera_path``, a list of objects with
     ``camera_to_world`` (16 numbers, row by row), ``fov`` (vertical, in degrees) and optionally
     ``render_time`` or ``time``; ``render_height``, ``render_width``, and ``fps`` or ``seconds``.
-    And transforms files: ``frames``, a list of ``transform_matrix`` [4, 4] and optionally ``time``;
-    ``camera_angle_x`` (horizontal, in radians), of all frames or in each; optionally ``w``, ``h``
-    and ``fps``.
+    A transforms file has ``frames``, a list of objects with ``transform_matrix`` [4, 4] and
+    optionally ``time``; ``camera_angle_x`` (horizontal, in radians), once or in each frame;
+    optionally ``w``, ``h`` and ``fps``.
 
-    Times run from 0 to 1 over the path where the file has none.
+    If the file has no times, they run from 0 to 1 over the path.
 
     Args:
-        path: The file. Poses are those of the run's world, with OpenGL's axes.
+        path: The file. Poses are in the run's world coordinates, with OpenGL's axes.
 
     Raises:
         SceneError: If the file is missing or damaged, or an entry is missing or out of range.
@@ -94,13 +94,13 @@ def read_camera_path(path: Path) -> CameraPath:
 
 
 def path_contents(views: Views, fps: int) -> dict[str, dict[str, Any]]:
-    """The cameras of views in the order of their times as camera paths, for `write_json`.
+    """Camera paths through the cameras of views, in the order of their times, for `write_json`.
 
-    Cameras of a path are perspective and look through the middle of their images: lenses and
-    principal points are left out, the vertical field of view is that of each image.
+    Cameras of a path are perspective with a centred principal point: distortion and principal
+    points are lost, the vertical field of view of each image is kept.
 
     Returns:
-        ``camera_path.json``, as nerfstudio has it, and ``transforms.json``, by name.
+        Contents of ``camera_path.json`` (nerfstudio's format) and ``transforms.json``, by name.
     """
     order = views.times.argsort(stable=True)
     tangents = 0.5 * views.intrinsics.size[order, 0] / views.intrinsics.pinhole[order, 1]
@@ -126,15 +126,15 @@ def path_contents(views: Views, fps: int) -> dict[str, dict[str, Any]]:
 
 
 Entries = dict[str, Mapping[str, Any]]
-"""Cameras of a path by what messages call them."""
+"""Cameras of a path by their names in messages."""
 
 
 def _entries(path: Path, content: Mapping[str, Any], key: str) -> Entries:
     found = content.get(key)
     if not isinstance(found, list) or not found:
         raise SceneError(
-            f'{path} holds no cameras. Its key "camera_path" (nerfstudio) or "frames" must hold at '
-            "least one"
+            f'{path} holds no cameras. Its key "camera_path" (nerfstudio) or "frames" must contain '
+            "at least one"
         )
     entries = {f"{path}: {key}[{index}]": entry for index, entry in enumerate(found)}
     for label, entry in entries.items():
@@ -174,7 +174,7 @@ def _poses(entries: Entries, key: str) -> Tensor:
 
 
 def _times(path: Path, entries: Entries, keys: tuple[str, ...]) -> Tensor:
-    """Time of each camera; from 0 to 1 over the path where no camera has one. [F]"""
+    """Time of each camera; from 0 to 1 over the path if no camera has one. [F]"""
     found = [next((e[k] for k in keys if e.get(k) is not None), None) for e in entries.values()]
     if all(time is None for time in found):
         return torch.linspace(0, 1, len(entries))
@@ -188,8 +188,8 @@ def _times(path: Path, entries: Entries, keys: tuple[str, ...]) -> Tensor:
     within = times.clamp(0, 1)
     if beyond := int((within != times).sum()):
         logger.warning(
-            "%s: %d of %d times lie a little below 0 or above 1, as splines overshoot; 0 or 1 "
-            "takes their place",
+            "%s: %d of %d times lie a little below 0 or above 1, as splines overshoot; they are "
+            "clamped to 0 or 1",
             *(path, beyond, len(times)),
         )
     return within

@@ -1,4 +1,4 @@
-"""All commands beside training: inspect, evaluate, render, view, export, table and others."""
+"""All commands except training: inspect, evaluate, render, view, export, table and others."""
 
 import argparse
 import sys
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def add_commands(commands: "argparse._SubParsersAction") -> None:
-    """Add the parsers of this wing's commands."""
+    """Add the parsers of the commands of `xplanes.tools`."""
     add_table(commands, COMMANDS)
 
 
@@ -24,7 +24,7 @@ RUN = {
     "run": option("the run directory, or hf://USER/REPOSITORY of the hub", metavar="RUN"),
     "--checkpoint": option("", "last", choices=["last", "best"]),
     "--plugin": option(
-        "your module with classes that the run's settings name; repeatable",
+        "your module with classes used in the run's settings; repeatable",
         action="append",
         default=[],
         metavar="MODULE",
@@ -52,7 +52,7 @@ def _inspect(options: argparse.Namespace) -> None:
     choice = choose(options.arguments)
     out = options.out or Path(f"inspect_{Path(choice.scene.scene).name}.png")
     check_out(out, choice.scene)
-    # Readers may say what they do; standard output is for JSON alone.
+    # Readers may print messages; standard output is reserved for the JSON.
     with contextlib.redirect_stdout(sys.stderr) if options.json else contextlib.nullcontext():
         capture = inspect(choice)
     write_picture(out, capture)
@@ -81,7 +81,7 @@ def _triplanes(options: argparse.Namespace) -> None:
 
 
 def _load(options: argparse.Namespace, split: str | None = None) -> "TrainedRun":
-    """The run that options of `RUN` name, of this machine or the hub."""
+    """Load the run that the options of `RUN` name, from this machine or the hub."""
     from xplanes.tools.hub import SCHEME, fetch
     from xplanes.tools.runs import find_run, load_run
 
@@ -92,7 +92,7 @@ def _load(options: argparse.Namespace, split: str | None = None) -> "TrainedRun"
 
 
 def _filled(cls: type[T], options: argparse.Namespace) -> T:
-    """A dataclass whose fields are called as the options are."""
+    """A dataclass with the options as its fields, by name."""
     return cls(**{entry.name: getattr(options, entry.name) for entry in fields(cls)})  # type: ignore[arg-type]
 
 
@@ -115,7 +115,7 @@ def _render(options: argparse.Namespace) -> None:
     check_out(options.out, wanted)
     trained = _load(options)
     height, width = wanted.shape(trained.scene.splits)
-    written = "as written" if wanted.cameras is not None else "back-and-forth"
+    written = "as in the file" if wanted.cameras is not None else "back-and-forth"
     camera = f"{options.path} camera, time {wanted.time or written}"
     say(f"frames      {wanted.count} of {width}x{height} px, {options.what}, {camera}\n")
     say(f"wrote {render_video(trained, wanted, options.out)}")
@@ -190,7 +190,7 @@ COMMANDS = {
         _download,
     ),
     "inspect": Command(
-        "print and draw what was read from a capture, and warn of common problems",
+        "summarise a capture in a table and a picture, and warn of common problems",
         {
             "arguments": option(
                 "the folder of a scene, settings of train.py, or both",
@@ -234,21 +234,21 @@ COMMANDS = {
         {
             **RUN,
             "--path": option(
-                "orbit or fixed (square frames), view:FILE (camera of a view, in its shape), or "
+                "orbit or fixed (square frames), view:FILE (camera and aspect ratio of a view), or "
                 "FILE.json (camera_path.json of nerfstudio, or a transforms file)",
                 "orbit",
             ),
             "--time": option(
-                "sweep, back-and-forth, own (that of view:FILE), or a number from 0 to 1; default: "
+                "sweep, back-and-forth, own (time of view:FILE), or a number from 0 to 1; default: "
                 "back-and-forth, own for an image of view:FILE, or the times of FILE.json"
             ),
             "--frames": option(
                 "number of frames; default: 48, or 1 if neither camera nor time moves", type=int
             ),
-            "--fps": option("frames per second; default: 16, or as FILE.json says", type=int),
+            "--fps": option("frames per second; default: 16, or the rate in FILE.json", type=int),
             "--size": option(
                 "pixels of the longer side; default: that of the training views, of the view, or "
-                "as FILE.json says",
+                "of FILE.json",
                 type=int,
             ),
             "--elevation": option("elevation of orbit and fixed in degrees", 20.0),
@@ -264,8 +264,8 @@ COMMANDS = {
         "interactive viewer in the browser (extra: viewer)",
         {
             **RUN,
-            "--port": option("port that is served; 0: any free one", 8080),
-            "--host": option("address that is served", "127.0.0.1"),
+            "--port": option("port to serve on; 0: any free one", 8080),
+            "--host": option("address to serve on", "127.0.0.1"),
         },
         _view,
     ),
@@ -275,8 +275,8 @@ COMMANDS = {
             **RUN,
             "--what": option(
                 "what to write: mesh or points (extra: export), web (one HTML file below 20 MB "
-                "that plays them; extra: export), planes (X-Planes only), path (of the training "
-                "cameras), or what a model adds, such as gaussians",
+                "that animates them; extra: export), planes (X-Planes only), path (through the "
+                "training cameras), or a format of the model, such as gaussians",
                 "mesh",
             ),
             "--out": option("empty or new; default: RUN/export/WHAT", **FOLDER),
@@ -296,7 +296,7 @@ COMMANDS = {
                 metavar="COUNT",
             ),
             "--format": option(
-                "of meshes and point clouds", "ply", dest="form", choices=["ply", "glb"]
+                "for meshes and point clouds", "ply", dest="form", choices=["ply", "glb"]
             ),
         },
         _export,
@@ -305,8 +305,8 @@ COMMANDS = {
         "upload a run to the Hugging Face hub",
         {
             "run": option("the run directory", type=Path, metavar="RUN"),
-            "repository": option("made if it does not exist yet", metavar="USER/REPOSITORY"),
-            "--private": option("make a private repository", action="store_true"),
+            "repository": option("created if it does not exist", metavar="USER/REPOSITORY"),
+            "--private": option("create a private repository", action="store_true"),
         },
         _push,
     ),
@@ -330,11 +330,9 @@ COMMANDS = {
                 "runs",
                 choices=["runs", "steps", "parts"],
             ),
-            "--show": option(
-                "what is shown of a view", "colour", choices=["colour", "error", "depth"]
-            ),
+            "--show": option("quantity to show", "colour", choices=["colour", "error", "depth"]),
             "--view": option(
-                "a view, as named in RUN/media, or the end of its name; default: one that all show"
+                "a view, as named in RUN/media, or the end of its name; default: one that all have"
             ),
             "--steps": option("numbers of steps, separated by commas; default: all, or the last"),
             "--size": option("pixels of a picture", 160),

@@ -15,14 +15,14 @@ from xplanes.tools.tabulate import SEED, mean
 
 SCENE = "data.scene"
 PLACES = 60
-"""Places along an axis at which curves of several seeds are averaged."""
+"""Number of positions along an axis at which curves of several seeds are averaged."""
 
 
 def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
-    """Draw PSNR against seconds, preparation included, and against steps, a column per scene.
+    """Plot PSNR against seconds, preparation included, and against steps, a column per scene.
 
     Returns:
-        Whether there was something to draw, and matplotlib (extra ``plots``) to draw it with.
+        Whether a plot was written: it needs curves and matplotlib (extra ``plots``).
     """
     over = [name for name in names if name not in (SEED, SCENE)]
     lines: dict[tuple[str, str], list[tuple[Point, ...]]] = {}
@@ -60,17 +60,17 @@ def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> boo
 
 
 def plot_against(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
-    """Draw final PSNR against a setting that has three values or more, mean over scenes and seeds.
+    """Plot final PSNR, as mean over scenes and seeds, against a setting with at least three values.
 
     Returns:
-        Whether there was one such setting, and matplotlib (extra ``plots``) to draw it with.
+        Whether a plot was written: it needs exactly one such setting, and matplotlib.
     """
     done = [row for row in rows if "psnr" in row.scores]
     numeric = {}
     for name in names:
         values = [row.settings.get(name) for row in done]
         if name != SEED and all(value is None or is_number(value) for value in values):
-            # Null, all of something, lies behind all others.
+            # null means all, so it is the last value of the axis.
             places = [math.inf if value is None else float(value) for value in values]
             numeric |= {name: places} if len(set(places)) > 2 else {}
     if len(numeric) != 1 or not importlib.util.find_spec("matplotlib"):
@@ -102,7 +102,7 @@ def _save(figure: Any, path: Path) -> bool:
 
 
 def run_label(row: RunRow, names: Sequence[str]) -> str:
-    """A run by the settings in which it differs from others."""
+    """Label of a run: the settings in which it differs from others."""
     parts = [
         str(value) if name.endswith(".name") else f"{name.rsplit('.', 1)[-1]}={value}"
         for name in names
@@ -112,7 +112,7 @@ def run_label(row: RunRow, names: Sequence[str]) -> str:
 
 
 def _mean_curve(runs: Sequence[Sequence[Point]], axis: str) -> tuple[list[float], list[float]]:
-    """The mean of curves over what they have in common; a single curve as it is."""
+    """The mean of curves over their common range; a single curve is unchanged."""
     curves = [([getattr(p, axis) for p in run], [p.psnr for p in run]) for run in runs]
     if len(curves) == 1:
         return curves[0]

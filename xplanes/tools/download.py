@@ -1,4 +1,4 @@
-"""The public D-NeRF scenes, downloaded, checked and unpacked."""
+"""Downloads, checks and unpacks the public D-NeRF scenes."""
 
 import hashlib
 import json
@@ -23,29 +23,29 @@ PROGRESS_SECONDS = 5.0
 
 
 class FetchError(Exception):
-    """A file could not be fetched, for the reason in the message."""
+    """A file could not be downloaded; the message is the reason."""
 
 
 class _BrokenTransferError(Exception):
-    """The transfer stopped before its end; asking again may help."""
+    """The transfer was interrupted; another attempt may succeed."""
 
 
 def fetch(
     url: str, path: Path, *, announce: Callable[[str], None] = print, space_factor: float = 1.0
 ) -> None:
-    """Download ``url`` to ``path``; what has arrived survives in ``path``.part until then.
+    """Download ``url`` to ``path``; an incomplete download is kept in ``path``.part.
 
-    A second call continues where the first was interrupted, provided that the server still has the
-    same file (compared by ETag or modification time) and can send parts of it.
+    Another call resumes an interrupted download, if the server still has the same file (compared by
+    ETag or modification time) and supports range requests.
 
     Args:
         url: Address, http or https.
-        path: Where the complete file appears, all at once.
-        announce: Takes lines about progress.
-        space_factor: Free disk space to insist on, in sizes of the file.
+        path: The file, which is written atomically.
+        announce: Receives progress messages.
+        space_factor: Required free disk space, in multiples of the file's size.
 
     Raises:
-        FetchError: The address cannot be reached or refuses, or the disk is too full.
+        FetchError: The server cannot be reached or refuses, or the disk is too full.
     """
     if not url.startswith(("http://", "https://")):
         raise FetchError(f"{url} is not an http or https address.")
@@ -67,7 +67,7 @@ def fetch(
 
 
 def _advance(url: str, part: Path, announce: Callable[[str], None], space_factor: float) -> None:
-    """Fetch what is missing of ``part``, or all of it if it cannot be continued."""
+    """Download the rest of ``part``, or all of it if it cannot be resumed."""
     validator = _saved_validator(url, part)
     start = part.stat().st_size if validator else 0
     headers = {"User-Agent": "xplanes", "Accept-Encoding": "identity"}
@@ -93,7 +93,7 @@ def _advance(url: str, part: Path, announce: Callable[[str], None], space_factor
                 raise _BrokenTransferError(f"{url} has changed since the download began")
             announce(f"Continuing {url} after {_size(part)} MB")
         else:
-            if response.headers.get_content_type() == "text/html":  # What is there is kept.
+            if response.headers.get_content_type() == "text/html":  # ``part`` is kept.
                 raise FetchError(f"{url} answered with a web page instead of a file.")
             start = 0
             _save_validator(url, part, response)
@@ -129,7 +129,7 @@ def _receive(
                 reported = time.monotonic()
                 of_total = f" of {total / 1e6:.0f}" if total else ""
                 announce(f"{received / 1e6:.0f}{of_total} MB")
-    # Python reports a connection that ends early as the end of the file.
+    # Python returns an empty chunk if the connection ends early.
     if total is not None and received < total:
         raise _BrokenTransferError(
             f"The connection to {url} ended after {received / 1e6:.1f} of {total / 1e6:.1f} MB"
@@ -137,10 +137,10 @@ def _receive(
 
 
 def check_space(folder: Path, needed: int) -> None:
-    """Refuse to fill a disk.
+    """Check the free space of a disk.
 
     Raises:
-        FetchError: Fewer than ``needed`` bytes are free where ``folder`` lies.
+        FetchError: Fewer than ``needed`` bytes are free on the disk of ``folder``.
     """
     free = shutil.disk_usage(folder).free
     if free < needed:
@@ -151,7 +151,7 @@ def check_space(folder: Path, needed: int) -> None:
 
 
 def _validator(response: HTTPResponse) -> str | None:
-    """What names this version of the file: a strong ETag, else the modification time."""
+    """Identifier of this version of the file: a strong ETag, else the modification time."""
     tag = response.headers.get("ETag")
     if tag and not tag.startswith("W/"):
         return tag
@@ -159,7 +159,7 @@ def _validator(response: HTTPResponse) -> str | None:
 
 
 def _saved_validator(url: str, part: Path) -> str | None:
-    """The version that ``part`` is the beginning of, if that is known."""
+    """Identifier of the version of the file in ``part``; None if unknown."""
     if not part.exists():
         return None
     try:
@@ -170,7 +170,7 @@ def _saved_validator(url: str, part: Path) -> str | None:
 
 
 def _save_validator(url: str, part: Path, response: HTTPResponse) -> None:
-    # The old beginning goes first, so that it never lies beside the new version's name.
+    # Delete the old part first, so that it is never paired with the new identifier.
     _discard(part)
     note = {"url": url, "validator": _validator(response)}
     _note_path(part).write_text(json.dumps(note), encoding="utf-8")
@@ -189,12 +189,12 @@ def _size(path: Path) -> str:
     return f"{path.stat().st_size / 1e6:.1f}"
 
 
-# Named by the README of github.com/albertpumarola/D-NeRF; with dl=1 it sends the file itself.
-# Nobody publishes a checksum of the archive, so its own CRCs and the table below must do.
+# From the README of github.com/albertpumarola/D-NeRF; dl=1 requests the file itself.
+# No checksum of the archive is published, so its CRCs and the table below are checked.
 DNERF_URL = "https://www.dropbox.com/s/0bf6fl0ye2vz3vr/data.zip?dl=1"
 ARCHIVE = "dnerf.zip"
 
-# Number of training views of each scene, as its readers and configurations state it.
+# Number of training views of each scene.
 TRAIN_VIEWS = {
     "bouncingballs": 150,
     "hellwarrior": 100,
@@ -216,19 +216,19 @@ def download_dnerf(
     sha256: str | None = None,
     announce: Callable[[str], None] = print,
 ) -> Path:
-    """Put the eight D-NeRF scenes into ``root``, each whole or not at all.
+    """Download the eight D-NeRF scenes into ``root``; incomplete scenes are never left there.
 
-    An interrupted download continues at the next call. Scenes that are already there stay as
-    they are. An archive fetched by hand is used if it lies in ``root`` as dnerf.zip.
+    The next call resumes an interrupted download. Existing scenes are not changed. An archive that
+    was downloaded manually is used if it is in ``root`` as dnerf.zip.
 
     Args:
-        root: Folder that will hold one folder per scene; made if absent.
+        root: Folder for one folder per scene; created if missing.
         url: Address of the archive.
-        sha256: Checksum that the archive must have, in hexadecimal; None skips the comparison.
-        announce: Takes lines about progress.
+        sha256: Required checksum of the archive, in hexadecimal; None skips the comparison.
+        announce: Receives progress messages.
 
     Returns:
-        The folder that holds the scenes: the value for data.root.
+        The folder of the scenes, which is the value for data.root.
 
     Raises:
         SceneError: The archive cannot be fetched, is damaged, or is not the expected one.
@@ -262,7 +262,7 @@ def _downloaded(root: Path, url: str, sha256: str | None, announce: Callable[[st
             announce(f"Using {archive}, which is already there")
         else:
             announce(f"Downloading {url} to {archive}")
-            # Images hardly compress: unpacked they take about as much room again.
+            # Images hardly compress, so unpacking takes the same space again.
             fetch(url, archive, announce=announce, space_factor=2.1)
         _check_sum(archive, sha256)
         _install(archive, root, missing, announce)
@@ -294,11 +294,11 @@ def _check_sum(archive: Path, sha256: str | None) -> None:
     with archive.open("rb") as file:
         found = hashlib.file_digest(file, "sha256").hexdigest()
     if found != sha256.lower():
-        raise _BadArchiveError(f"its SHA-256 is {found}, but {sha256.lower()} was asked for")
+        raise _BadArchiveError(f"its SHA-256 is {found} instead of {sha256.lower()}")
 
 
 def _install(archive: Path, root: Path, names: list[str], announce: Callable[[str], None]) -> None:
-    """Unpack beside the target, check everything, and only then move scenes into place."""
+    """Unpack into a temporary folder, check all scenes, and only then move them into place."""
     workspace = root / ".dnerf-unpacking"
     shutil.rmtree(workspace, ignore_errors=True)
     try:
@@ -325,7 +325,7 @@ def _unpack(archive: Path, workspace: Path, names: list[str]) -> None:
             for member, target in wanted:
                 path = workspace / target
                 path.parent.mkdir(parents=True, exist_ok=True)
-                # Reading to the end compares the member's CRC.
+                # Reading to the end verifies the member's CRC.
                 with source.open(member) as packed, path.open("wb") as file:
                     shutil.copyfileobj(packed, file, 1 << 20)
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as problem:
@@ -333,7 +333,7 @@ def _unpack(archive: Path, workspace: Path, names: list[str]) -> None:
 
 
 def _target(member: str) -> PurePosixPath | None:
-    """Where a member belongs, as scene/...; None for what is no part of a scene."""
+    """Path of a member, as scene/...; None if it is not part of a scene."""
     path = PurePosixPath(member)
     if path.is_absolute() or ".." in path.parts or "\\" in member or ":" in member:
         raise _BadArchiveError(f"its member {member!r} leads out of the folder")
@@ -342,7 +342,7 @@ def _target(member: str) -> PurePosixPath | None:
 
 
 def _check_scene(folder: Path, announce: Callable[[str], None]) -> None:
-    """Compare an unpacked scene with what the data set is known to hold."""
+    """Compare an unpacked scene with the known contents of the data set."""
     name = folder.name
     for split in SPLITS:
         try:
@@ -359,6 +359,6 @@ def _check_scene(folder: Path, announce: Callable[[str], None]) -> None:
             raise _BadArchiveError(
                 f"{name} has {len(files)} training views instead of {TRAIN_VIEWS[name]}"
             )
-        # Only the number of training views is certain, so a difference here is no error.
+        # The number of test views is not certain, so a difference is no error.
         if split == "test" and len(files) != TEST_VIEWS:
             announce(f"Note: {name} has {len(files)} test views; {TEST_VIEWS} are usual")

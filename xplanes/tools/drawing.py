@@ -1,4 +1,4 @@
-"""What the viewer shows: pictures of a field from any camera, cropped, and its floaters."""
+"""Pictures of the viewer: a field from any camera, optionally cropped, and its floaters."""
 
 import math
 from collections.abc import Callable
@@ -21,17 +21,17 @@ from xplanes.training.scores import VISIBLE
 MODES = ("colour", "depth", "opacity", "floaters")
 
 NEAREST = 4
-"""Training images, the nearest in time, that decide what a floater is."""
+"""Number of training images, nearest in time, whose silhouettes identify floaters."""
 
 SLACK = 0.02
-"""Distance from a silhouette, in the field's frame, at which something may still belong to it."""
+"""Margin around silhouettes, in the field's frame, within which nothing counts as a floater."""
 
 RED = (0.9, 0.1, 0.1)
 
 
 @dataclass(frozen=True)
 class Shot:
-    """What a picture is to show.
+    """Camera, time and mode of a picture.
 
     Attributes:
         pose: Camera-to-world matrix, in the field's frame. [4, 4]
@@ -40,7 +40,7 @@ class Shot:
         height: Rows.
         aspect: Columns per row.
         mode: One of `MODES`.
-        box: Least and largest corner of what is shown, in the field's frame; None for all. [2, 3]
+        box: Least and largest corner of the crop, in the field's frame; None for all. [2, 3]
     """
 
     pose: Tensor
@@ -69,11 +69,11 @@ class Shot:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture, and what lies in front of what in it.
+    """A picture with its depth.
 
     Attributes:
         colours: From 0 to 1. [H, W, 3]
-        depth: Distance along the optical axis of what stops at least half of the light; infinity
+        depth: Distance along the optical axis where the opacity is at least 0.5; infinity
             elsewhere. [H, W]
     """
 
@@ -96,13 +96,13 @@ def draw(
 
     Args:
         field: The field.
-        renderer: Renders it.
-        shot: What to show.
-        views: Training views, whose silhouettes tell floaters.
+        renderer: The renderer.
+        shot: Camera, time and mode.
+        views: Training views, whose silhouettes identify floaters.
         frame: The field's frame.
-        background: Colour behind the scene. [3]
-        at_once: Rays after which ``stop`` is asked, where single rays are rendered.
-        stop: Whether the picture is no longer wanted.
+        background: Background colour. [3]
+        at_once: Rays per call of ``stop``, with a `RayRenderer`.
+        stop: Function that returns whether to abandon the picture.
 
     Returns:
         The picture on the CPU; None once ``stop`` returns true.
@@ -112,7 +112,7 @@ def draw(
     background = background.to(device)
     shown, solid = field, renderer
     if box is not None or shot.mode == "floaters":
-        # Surfaces that the grid knows may be cropped away; they must hide nothing then.
+        # The grid's surfaces may be cropped away, and then they must not occlude anything.
         solid = replace(renderer, occlusion=0.0) if isinstance(renderer, GridRenderer) else renderer
     if box is not None:
         shown = field.masked(in_box(box.to(device)))
@@ -155,7 +155,7 @@ def _seen(
     shot: Shot,
     background: Tensor,
 ) -> dict[str, Tensor]:
-    """What rays of a shot see; a renderer that takes no single rays renders the whole picture."""
+    """Render rays of a shot; a renderer that is no `RayRenderer` renders the whole picture."""
     if isinstance(renderer, RayRenderer):
         return renderer.image(field, origins, directions, shot.time, background)
     frame = Frame(1.0, torch.eye(3), torch.zeros(3))
@@ -164,14 +164,14 @@ def _seen(
 
 
 def shift(renderer: Renderer, position: Tensor, views: Views, frame: Frame) -> float:
-    """How far along its rays a camera must be moved for a renderer with near and far bounds.
+    """Distance by which to move ray origins for a renderer with near and far bounds.
 
-    These bounds hold for cameras as far from the scene as the training cameras; from elsewhere they
-    would cut it off. A camera inside the scene is moved back by no more than its near bound.
+    The bounds fit cameras as far from the scene as the training cameras; at other distances they
+    would cut the scene off. Origins are moved backwards by at most the near bound.
 
     Args:
-        renderer: Has ``near``, in the field's frame, if it has such bounds.
-        position: The camera's, in the field's frame. [3]
+        renderer: The renderer; its ``near``, in the field's frame, is used if it has one.
+        position: Position of the camera, in the field's frame. [3]
         views: Training views.
         frame: The field's frame.
     """
@@ -183,7 +183,7 @@ def shift(renderer: Renderer, position: Tensor, views: Views, frame: Frame) -> f
 
 
 def mark(colours: Tensor, share: Tensor) -> Tensor:
-    """A pale grey picture with floaters in red, where they are visible at all.
+    """A pale grey picture with visible floaters in red.
 
     Args:
         colours: The picture. [H, W, 3]
@@ -195,15 +195,15 @@ def mark(colours: Tensor, share: Tensor) -> Tensor:
 
 
 def in_box(box: Tensor) -> Callable[[Tensor], Tensor]:
-    """A function that tells which points [N, 3] lie in a box [2, 3]."""
+    """A function that returns which points [N, 3] are in a box [2, 3]."""
     return lambda points: ((points >= box[0]) & (points <= box[1])).all(dim=-1)
 
 
 def ruled_out(views: Views, frame: Frame, time: float) -> Callable[[Tensor], Tensor]:
-    """A function that tells which points [N, 3] of the field's frame training images show empty.
+    """A function that returns which points [N, 3] of the field's frame are outside of silhouettes.
 
-    These are the images nearest in time, of a static scene some from all over it. What lies out of
-    their sight, or within `SLACK` of a silhouette, is not ruled out.
+    The silhouettes are those of the training images nearest in time, or of evenly spaced ones in a
+    static scene. Points out of their view, or within `SLACK` of a silhouette, are not ruled out.
     """
     if views.is_static:
         chosen = torch.tensor(spread(NEAREST, len(views)))
@@ -219,10 +219,10 @@ def ruled_out(views: Views, frame: Frame, time: float) -> Callable[[Tensor], Ten
 
 
 def camera_outlines(views: Views, frame: Frame, length: float) -> tuple[Tensor, Tensor]:
-    """Frustums of training cameras as lines; lenses that distort have curved borders.
+    """Frusta of training cameras as lines; with distortion their borders are curved.
 
     Args:
-        views: Training views; at most `MOST_CAMERAS` of them are drawn, spread evenly.
+        views: Training views; at most `MOST_CAMERAS` of them, evenly spaced, are drawn.
         frame: The field's frame.
         length: Distance from a camera's centre to its image's corners, in the field's frame.
 
@@ -234,7 +234,7 @@ def camera_outlines(views: Views, frame: Frame, length: float) -> tuple[Tensor, 
         height, width = views.size(index)
         steps = 1 if views.intrinsics.lens(index) is None else 8
         share = torch.arange(steps) / steps
-        # Around the image: along the top, down the right side, and so on.
+        # Along the top, down the right side, back along the bottom, and up the left side.
         there, back, none, all_ = share, 1 - share, torch.zeros(steps), torch.ones(steps)
         columns = torch.cat([there, all_, back, none]) * width - 0.5
         rows = torch.cat([none, there, all_, back]) * height - 0.5
@@ -249,4 +249,4 @@ def camera_outlines(views: Views, frame: Frame, length: float) -> tuple[Tensor, 
 
 
 MOST_CAMERAS = 100
-"""Training cameras that are drawn at most."""
+"""Most training cameras that are drawn."""

@@ -19,26 +19,26 @@ WEIGHTS = {
     "vgg": ("VGG16_Weights", "528 MB"),
     "alex": ("AlexNet_Weights", "233 MB"),
 }
-"""Name in torchvision and size of the backbone's weights, by the network's name."""
+"""Name in torchvision and download size of the weights of each LPIPS backbone."""
 
 SMALLEST = 32
-"""Pixels a side below which the networks have nothing left to compare."""
+"""Least pixels per side for which the networks have feature maps."""
 
 Metric = Callable[[Tensor, Tensor], float]
-"""From a prediction and the truth, in [0, 1], to a distance. [H, W, 3], [H, W, 3]"""
+"""Distance of a prediction from the ground truth, both in [0, 1]. [H, W, 3], [H, W, 3]"""
 
 
 def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
-    """Score all views of the run's split with the code that scores them in training.
+    """Compute scores of all views of the run's split, with the same code as in training.
 
     Args:
         trained: The run.
-        network: Network of LPIPS, ``vgg`` or ``alex``, downloaded if need be; ``none`` leaves LPIPS
-            out; None takes vgg if it is on this machine.
+        network: Backbone of LPIPS, ``vgg`` or ``alex``, downloaded if necessary; ``none`` for no
+            LPIPS; None for vgg if it is already downloaded.
 
     Returns:
-        What `write_scores` writes: the keys of metrics.json as far as they are scores, and
-        ``not_computed``, from a score's name to the reason.
+        Content for `write_scores`: scores with the keys of metrics.json, and ``not_computed``, a
+        mapping from the names of missing scores to the reasons.
     """
     views, parts = trained.views, (trained.module.field, trained.module.renderer, trained.frame)
     name = network or DEFAULT_NETWORK
@@ -70,7 +70,7 @@ def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
 
 
 def write_scores(run: Path, scores: dict[str, Any]) -> Path:
-    """Write evaluation_<split>.json, or evaluation_<split>_best.json; metrics.json stays."""
+    """Write evaluation_<split>.json or evaluation_<split>_best.json; metrics.json is unchanged."""
     mark = "" if scores["checkpoint"] == "last" else f"_{scores['checkpoint']}"
     path = run / f"evaluation_{scores['split']}{mark}.json"
     write_json(path, scores)
@@ -107,13 +107,13 @@ def lpips(network: str, side: int, device: str, *, download: bool) -> Metric:
     """The LPIPS distance; lower is better.
 
     Args:
-        network: ``vgg`` or ``alex``: their numbers cannot be compared.
+        network: ``vgg`` or ``alex``; their values are not comparable.
         side: Pixels of the shorter side of the images.
-        device: Where to compute.
-        download: Fetch the backbone's weights if they are not on this machine.
+        device: Device to compute on.
+        download: Whether to download the backbone's weights if they are missing.
 
     Raises:
-        UnavailableError: If anything is missing; the message says what.
+        UnavailableError: If a package, the weights or the images' size rule it out.
     """
     if side < SMALLEST:
         raise UnavailableError(f"images of {side} pixels are below {SMALLEST}")
@@ -130,7 +130,7 @@ def lpips(network: str, side: int, device: str, *, download: bool) -> Metric:
 
     try:
         if is_there(file):
-            # torchvision would read the file as a pickle, which may run code.
+            # Refuse a malicious pickle: torchvision would load the file unrestricted.
             torch.load(file, map_location="cpu", weights_only=True)
         metric = LearnedPerceptualImagePatchSimilarity(
             net_type=network,  # type: ignore[arg-type]

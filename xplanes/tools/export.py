@@ -27,36 +27,36 @@ from xplanes.tools.export_web import Shape, write_page
 from xplanes.tools.runs import TrainedRun
 
 KINDS = ("mesh", "points", "planes", "path", "web")
-"""What is written of every field, or of X-Planes; a field may have more in its `exports`."""
+"""Values of ``--what`` without those that a field adds with its `exports`."""
 FORMATS = ("ply", "glb")
 
 TIMES, WEB_TIMES = 10, 24
-"""Timesteps of a dynamic scene where none are named: as files, and in a page that plays them."""
+"""Default number of timesteps of a dynamic scene, for files and for a web page."""
 
 POINTS = 100_000
-"""Points of a point cloud where no number is named."""
+"""Default number of points of a point cloud."""
 
 PAGE = "index.html"
-"""The file of a web page."""
+"""File name of a web page."""
 
 COARSEST = 8
 """Least grid points along each side of the cube."""
 
 LARGEST = 1024
-"""Grid points along each side of the cube; as many as that take 4 GB."""
+"""Most grid points along each side of the cube; this many take 4 GB."""
 
 CAMERAS, RAYS, SAMPLES = 8, 4096, 256
-"""Training cameras, rays of each and samples of a ray that silhouettes are compared in."""
+"""Training cameras, rays per camera and samples per ray for the comparison of silhouettes."""
 
 THINNEST, DENSEST, CANDIDATES = 1e-3, 5.0, 96
-"""Optical depths of one grid cell between which the threshold lies, and how many are compared."""
+"""Smallest and largest threshold, as optical depths of a grid cell, and number of candidates."""
 
 PLATEAU = 0.001
 """Intersections over union that differ by less count as equal."""
 
 
 Z_UP_TO_Y_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
-"""Rotates a scene whose z axis points up, as here, so that its y axis does."""
+"""Rotation from coordinates with z up, which xplanes uses, to y up."""
 
 
 @dataclass(frozen=True)
@@ -67,11 +67,11 @@ class ExportOptions:
         what: ``mesh``, ``points``, ``planes``, ``path``, ``web``, or a name in the field's
             `exports`.
         times: A number of times spread evenly from 0 to 1, or times separated by commas; None for
-            10, 24 in a web page, or 1 in a static scene.
+            10 times, 24 for a web page, or 1 for a static scene.
         resolution: Grid points along each side of the field's cube.
-        threshold: Density of the surface, per unit length of the field's frame; found when None.
-        count: Points of a point cloud, 100,000 when None; a web page has points in place of a mesh
-            if it is given.
+        threshold: Density of the surface, per unit length of the field's frame; None for the one
+            that `find_threshold` returns.
+        count: Points of a point cloud; None for 100,000, or for a mesh in a web page.
         form: File format of meshes and point clouds: ``ply`` or ``glb``.
     """
 
@@ -83,7 +83,7 @@ class ExportOptions:
     form: str = "ply"
 
     def check(self) -> None:
-        """Refuse options that nothing can be exported with.
+        """Check the options without a run.
 
         Raises:
             ConfigError: With the option, its value and what is allowed.
@@ -147,7 +147,7 @@ def export(
     *,
     say: Callable[[str], None],
 ) -> Path:
-    """Write what other programs read of a run, and ``export.json``, which lists the files.
+    """Export a run for other programs, and list the files in ``export.json``.
 
     Args:
         trained: The run.
@@ -177,8 +177,8 @@ def export(
         facts["files"] = write(folder, trained)
     else:
         if getattr(field, "background", None) is not None:
-            facts["left_out"] = "what lies behind the field's cube"
-            say(f"left out    {facts['left_out']}, which has no surface; --what planes has it")
+            facts["left_out"] = "the background outside of the field's cube"
+            say(f"left out    {facts['left_out']}; --what planes exports it")
         several = WEB_TIMES if options.what == "web" else TIMES
         times = export_times(options.times or str(1 if trained.is_static else several))
         facts |= {"times": times} | _write_times(folder, trained, options, times, say)
@@ -193,7 +193,7 @@ def _write_times(
     times: list[float],
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Write what changes with time; what `export.json` says of it."""
+    """Write the files that depend on time; return their entries of ``export.json``."""
     paths = [folder / f"{options.what}_{number:04d}" for number in range(len(times))]
     if (write_own := trained.module.field.exports.get(options.what)) is not None:
         pairs = zip(paths, times, strict=True)
@@ -209,7 +209,7 @@ def _write_times(
         for _ in tqdm(written, "times", len(times), leave=False, delay=2, disable=None):
             pass
     except ConfigError:
-        for path in files:  # So that another threshold can be tried in this folder.
+        for path in files:  # Another threshold can then be tried with the same folder.
             path.unlink(missing_ok=True)
         raise
     facts = {"resolution": options.resolution, "threshold": threshold}
@@ -217,10 +217,10 @@ def _write_times(
 
 
 def _threshold(trained: TrainedRun, options: ExportOptions, times: list[float]) -> float | None:
-    """Density of the surface; None where the field has a surface or points of its own.
+    """Density of the surface; None if the field defines a surface or points itself.
 
     Raises:
-        ConfigError: If the field has none of these, or does not use a threshold that was given.
+        ConfigError: If the field has none of these, or a threshold is given but not used.
         MissingExtraError: For a surface without the extra ``export``.
     """
     field, threshold = trained.module.field, options.threshold
@@ -254,7 +254,7 @@ def shape_at(
         time: From 0 to 1.
         resolution: Grid points along each side of the field's cube.
         threshold: Density of the surface; None for a field of signed distances.
-        count: Points on it in place of triangles.
+        count: Number of points to sample on the surface; None for triangles.
 
     Raises:
         ConfigError: If there is no surface.
@@ -267,7 +267,7 @@ def shape_at(
         normals = mesh.face_normals[faces]
     points = torch.tensor(places, dtype=torch.float32)
     outward = torch.tensor(normals, dtype=torch.float32)
-    # What one sees of a soft surface lies a little below it.
+    # The visible colour of a soft surface comes from slightly below it.
     depth = 0 if threshold is None else 2 / resolution
     colours = surface_colours(trained, points - depth * outward, outward, time)
     return Shape(trained.frame.to_world(points), colours, mesh.faces if count is None else None)
@@ -284,7 +284,7 @@ def _write_each(
     count = None if options.what == "mesh" else POINTS if options.count is None else options.count
     for time, path in zip(times, files, strict=True):
         shape = shape_at(trained, time, options.resolution, threshold, count)
-        # GLB has linear colours as its standard says; PLY files are in sRGB.
+        # The GLB standard prescribes linear colours; PLY files use sRGB.
         colours = _linear(shape.colours) if options.form == "glb" else shape.colours
         pixels = (255 * colours).round().byte().numpy()
         world = shape.places.numpy()
@@ -306,7 +306,7 @@ def _write_web(
     times: list[float],
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Write the page of all timesteps; what `export.json` says of it."""
+    """Write the web page with all timesteps; return its entries of ``export.json``."""
     field = trained.module.field
 
     def coarser(share: float) -> int:
@@ -338,16 +338,16 @@ def _write_web(
         shown = f"{written['triangles']:,} triangles at resolution {coarser(share)}"
     else:
         shown = f"{written['vertices']:,} points"
-    fitted = "" if share == 1 else f"; {share:.0%} of what was wanted, to stay below 20 MB"
+    fitted = "" if share == 1 else f"; reduced to {share:.0%} to stay below 20 MB"
     say(f"page        {len(times)} timesteps, {shown}{fitted}; {written['bytes'] / 1e6:.1f} MB")
     return facts
 
 
 def _glb(geometry: Any) -> bytes:
-    """A GLB that viewers show upright and matt.
+    """A GLB file with y up and a matt material.
 
-    The standard's y axis points up, the world's z axis does; without a material, surfaces would be
-    of metal, black where nothing is reflected.
+    GLB's y axis points up, the world's z axis does. The default material is metallic, and black
+    where nothing is reflected.
     """
     _, trimesh = _mesh_tools()
     scene = trimesh.Scene()
@@ -364,7 +364,7 @@ def _glb(geometry: Any) -> bytes:
 
 
 def _linear(colours: Tensor) -> Tensor:
-    """Colours of sRGB in proportion to light. [...]"""
+    """Convert colours from sRGB to linear. [...]"""
     return torch.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
 
 
@@ -377,7 +377,7 @@ def surface(trained: TrainedRun, time: float, resolution: int, threshold: float 
         time: From 0 to 1.
         resolution: Grid points along each side of the field's cube.
         threshold: Density of the surface; None for a field of signed distances, whose surface is
-            where they are 0.
+            their zero level set.
 
     Returns:
         A closed ``trimesh.Trimesh`` in the field's frame, without colours.
@@ -390,9 +390,9 @@ def surface(trained: TrainedRun, time: float, resolution: int, threshold: float 
     level = 0.0 if threshold is None else -math.expm1(-threshold * 2 / resolution)
     if not float(volume.max()) > level:
         raise ConfigError(_nothing(time, volume, threshold))
-    # Beyond the cube there is nothing, so that a surface is closed where it meets the cube.
+    # Padding with empty values closes the surface where it meets the cube.
     padded = F.pad(volume, [1] * 6, value=empty).numpy()
-    # Faces turn counter-clockwise seen from where values are smaller.
+    # Faces are counter-clockwise when seen from the side with smaller values.
     vertices, faces, _, _ = measure.marching_cubes(
         padded, level, gradient_direction="ascent", allow_degenerate=False
     )
@@ -412,11 +412,11 @@ def _nothing(time: float, volume: Tensor, threshold: float | None) -> str:
 
 @torch.no_grad()
 def solidity(trained: TrainedRun, time: float, resolution: int) -> tuple[Tensor, float]:
-    """How solid the field is at the centres of the cells of a grid, where its renderer looks.
+    """Sample the field at the centres of a grid's cells, as opacity or as depth below its surface.
 
-    That is the opacity of one cell, which interpolates better than a density, whose values inside
-    solid objects mean little; for a field of signed distances the depth below the surface, limited
-    to a cell on either side. Points in empty cells of the occupancy grid are not evaluated.
+    Opacity of one cell is used instead of density: density varies widely inside solid objects, so
+    it interpolates badly. For a field of signed distances it is the depth below the surface, at
+    most a cell on either side. Points in empty cells of the occupancy grid are not evaluated.
 
     Args:
         trained: The run.
@@ -424,8 +424,8 @@ def solidity(trained: TrainedRun, time: float, resolution: int) -> tuple[Tensor,
         resolution: Grid points along each side of the field's cube.
 
     Returns:
-        Values on the CPU [resolution, resolution, resolution], axes x, y, z; and the value where
-        there is nothing.
+        Values on the CPU [resolution, resolution, resolution], axes x, y, z; and the value of
+        empty space.
     """
     field, renderer = trained.module.field, trained.module.renderer
     device, cell = renderer.device, 2 / resolution
@@ -451,7 +451,7 @@ def solidity(trained: TrainedRun, time: float, resolution: int) -> tuple[Tensor,
 
 
 def _looked_at(trained: TrainedRun, points: Tensor, time: float) -> Tensor:
-    """Whether rays that pass points of the cube see what is there. bool [N]"""
+    """Whether the renderer evaluates the field at points of the cube. bool [N]"""
     renderer = trained.module.renderer
     if isinstance(renderer, GridRenderer) and renderer.skip_empty:
         grid = renderer.grid
@@ -462,11 +462,11 @@ def _looked_at(trained: TrainedRun, points: Tensor, time: float) -> Tensor:
 
 @torch.no_grad()
 def find_threshold(trained: TrainedRun, resolution: int, time: float) -> float:
-    """The density whose surface has the silhouettes that the field shows the training cameras.
+    """The density threshold whose surface matches the field's silhouettes best.
 
-    A pixel lies in the field's silhouette where at least half of the light is stopped, and in the
-    surface's where its ray passes a density above the threshold. Of all thresholds it is the one
-    at which the two agree best, by intersection over union.
+    Silhouettes are those of training cameras. A pixel is in the field's silhouette if its opacity
+    is at least 0.5, and in the surface's if its ray passes a density above the threshold. The
+    threshold maximises the intersection over union of the two.
 
     Args:
         trained: The run.
@@ -477,7 +477,7 @@ def find_threshold(trained: TrainedRun, resolution: int, time: float) -> float:
         Density per unit length of the field's frame.
 
     Raises:
-        ConfigError: If the field stops half of the light nowhere.
+        ConfigError: If no pixel has an opacity of 0.5.
     """
     volume = solidity(trained, time, resolution)[0]
     views, renderer = trained.scene.splits["train"], trained.module.renderer
@@ -499,8 +499,8 @@ def find_threshold(trained: TrainedRun, resolution: int, time: float) -> float:
     inside, peak = torch.cat(shown), torch.cat(peaks)
     if not inside.any():
         raise ConfigError(
-            f"at time {time:g} the field stops half of the light in no pixel of the training "
-            "cameras, so that it has no silhouette: train longer, or set --threshold"
+            f"at time {time:g} no pixel of the training cameras has an opacity of 0.5, so the "
+            "field has no silhouette: train longer, or set --threshold"
         )
     depths = torch.logspace(math.log10(THINNEST), math.log10(DENSEST), CANDIDATES)
     hit = peak[:, None] > -torch.expm1(-depths)
@@ -511,7 +511,7 @@ def find_threshold(trained: TrainedRun, resolution: int, time: float) -> float:
 
 
 def _peaks(volume: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
-    """Largest value that rays pass in a grid over the cube, interpolated. [R]"""
+    """Largest interpolated value along each ray in a grid over the cube. [R]"""
     near, far = ray_box(origins, directions)
     share = (torch.arange(SAMPLES) + 0.5) / SAMPLES
     distances = near[:, None] + (far - near)[:, None] * share
@@ -523,12 +523,12 @@ def _peaks(volume: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
 
 @torch.no_grad()
 def surface_colours(trained: TrainedRun, points: Tensor, normals: Tensor, time: float) -> Tensor:
-    """Colours of points on or below a surface, looked at against their normals.
+    """Colours of points on or below a surface, seen along the inverse normals.
 
     Args:
         trained: The run.
         points: In the field's frame. [N, 3]
-        normals: Unit vectors out of the surface. [N, 3]
+        normals: Unit normals that point outwards. [N, 3]
         time: From 0 to 1.
 
     Returns:
@@ -553,7 +553,7 @@ def write_paths(folder: Path, trained: TrainedRun) -> list[str]:
     """Write the training cameras in the order of their times as camera paths.
 
     Returns:
-        The files' names: ``camera_path.json``, as nerfstudio has it, and ``transforms.json``.
+        The files' names: ``camera_path.json``, in nerfstudio's format, and ``transforms.json``.
     """
     contents = path_contents(trained.scene.splits["train"], FPS)
     for name, content in contents.items():
@@ -568,13 +568,13 @@ def write_planes(folder: Path, trained: TrainedRun) -> list[str]:
         The files' names.
 
     Raises:
-        ConfigError: If the run's field is another one.
+        ConfigError: If the run's field is not an `XPlanes`.
     """
     field, renderer, frame = trained.module.field, trained.module.renderer, trained.frame
     if not isinstance(field, XPlanes):
         raise ConfigError(
-            f"--what planes: {trained.experiment.method.model.name} has no planes that X-Planes' "
-            "layout describes; mesh and points work with every radiance field"
+            f"--what planes: {trained.experiment.method.model.name} has no planes in the layout of "
+            "X-Planes; mesh and points work with every radiance field"
         )
     tensors = {f"planes.{name}": plane for name, plane in field.planes.items()}
     tensors |= {f"decoder.{name}": value for name, value in field.decoder.state_dict().items()}

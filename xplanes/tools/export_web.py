@@ -1,4 +1,4 @@
-"""One HTML file that plays a run's shapes over time: `xplanes export --what web`."""
+"""One HTML file that plays a run's surfaces over time: `xplanes export --what web`."""
 
 import base64
 import html
@@ -18,24 +18,24 @@ from xplanes.errors import ConfigError
 from xplanes.files import write_text
 
 PARTS = Path(__file__).parent / "web"
-"""The page, three.js, and where that comes from."""
+"""Folder of the page's template, three.js, and its version and licence."""
 
 LIMIT = 20_000_000
-"""Bytes that a page stays below; mail and most hosts take as much."""
+"""Largest size of a page in bytes, which mail and most hosts accept."""
 
 COARSEST = 1 / 100
-"""Share of the wanted triangles or points below which there are too many timesteps."""
+"""Share of the requested triangles or points below which there are too many timesteps."""
 
 SPARE = 100_000
-"""Bytes for everything but the shapes and the scripts."""
+"""Bytes reserved for everything except the shapes, the template and three.js."""
 
 STEPS = 2**16 - 1
-"""Coordinates along each side of a shape's bounding box."""
+"""Largest quantised coordinate along each side of a shape's bounding box."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A coloured surface, or points on one, at one time.
+    """A coloured surface or point cloud at one time.
 
     Attributes:
         places: Vertices or points in world coordinates. [N, 3]
@@ -57,19 +57,19 @@ def write_page(
     background: Tensor,
     eye: Tensor,
 ) -> dict[str, Any]:
-    """Write a page that needs no other file and no network.
+    """Write a self-contained page that needs no network.
 
     Args:
         path: The HTML file.
-        shape_at: The shape at a time from 0 to 1, with a share from 0 to 1 of its triangles or
-            points; the share is lowered until the page has less than 20 MB.
-        times: From 0 to 1.
-        title: Shown by the browser.
+        shape_at: Function from a time in [0, 1] and a share of the triangles or points in [0, 1]
+            to a shape; the share is lowered until the page is smaller than 20 MB.
+        times: Times to show, from 0 to 1.
+        title: Title of the page.
         background: Colour in sRGB, from 0 to 1. [3]
-        eye: First position of the camera, in world coordinates with z up. [3]
+        eye: Initial position of the camera, in world coordinates with z up. [3]
 
     Returns:
-        What was written: vertices, triangles, bytes, and the share.
+        Number of vertices, triangles and bytes, the share, and the version of three.js.
 
     Raises:
         ConfigError: If there are too many timesteps for the limit.
@@ -88,7 +88,7 @@ def write_page(
         "centre": ((low + high) / 2).tolist(),
         "radius": radius,
         "towards": (eye.numpy() - (low + high) / 2).tolist(),
-        # So large that points on a ball would cover it.
+        # Large enough for points on a sphere to cover it.
         "point": 0 if triangles else 4 * radius * (len(shapes) / vertices) ** 0.5,
         "shapes": shapes,
     }
@@ -97,7 +97,7 @@ def write_page(
         "title": html.escape(title),
         "notice": f"three.js {three['version']}, {three['homepage']}\n\n{licence}",
         "three": script,
-        "run": json.dumps(content).replace("<", "\\u003c"),  # No text may end the script.
+        "run": json.dumps(content).replace("<", "\\u003c"),  # Prevents </script>.
     }
     text = re.sub(r"\{\{(\w+)\}\}", lambda found: filled[found[1]], page)
     write_text(path, text)
@@ -113,7 +113,7 @@ def write_page(
 def _fitting(
     room: int, shape_at: Callable[[float, float], Shape], times: Sequence[float]
 ) -> tuple[list[dict[str, Any]], float]:
-    """Shapes that fit into ``room`` bytes, and the share of triangles or points in them."""
+    """Shapes that fit into ``room`` bytes, and their share of the triangles or points."""
     share = 1.0
     while share > COARSEST:
         shapes: list[dict[str, Any]] = []
@@ -135,13 +135,13 @@ def _packed_shape(shape: Shape) -> dict[str, Any]:
     places, colours = shape.places.numpy(), (255 * shape.colours).round().byte().numpy()
     low, size = places.min(axis=0), np.ptp(places, axis=0)
     cells = np.round((places - low) / np.where(size > 0, size, 1) * STEPS).astype("<u2")
-    if shape.faces is None:  # Neighbours one after the other take a third less.
+    if shape.faces is None:  # Spatial order saves a third of the bytes.
         order = np.lexsort((cells[:, 2], *(cells[:, :2] >> 11).T))
         cells, colours = cells[order], colours[order]
     content = packed(cells) + packed(colours)
     if shape.faces is not None:
         content += packed(shape.faces.astype("<u4"))
-    least, most = np.quantile(places, [0.01, 0.99], axis=0)  # Floaters shall not set the camera.
+    least, most = np.quantile(places, [0.01, 0.99], axis=0)  # Ignore floaters for the camera.
     return {
         "vertices": len(places),
         "faces": 0 if shape.faces is None else len(shape.faces),
@@ -154,14 +154,14 @@ def _packed_shape(shape: Shape) -> dict[str, Any]:
 
 
 def packed(values: np.ndarray) -> bytes:
-    """Unsigned integers as bytes that compress well; the page has the inverse.
+    """Arrange unsigned integers as bytes that compress well; the page has the inverse.
 
     Args:
         values: Little-endian. [N, C]
 
     Returns:
-        Differences from row to row, modulo the type's range, column by column; of a column first
-        all lowest bytes, the highest last.
+        Differences between rows, modulo the type's range, column by column; each column has all
+        lowest bytes first and all highest bytes last.
     """
     steps = np.diff(values, axis=0, prepend=np.zeros_like(values[:1])).T
     split = np.ascontiguousarray(steps).view(np.uint8).reshape(*steps.shape, -1)

@@ -15,16 +15,16 @@ from xplanes.tools.runs import OUTPUTS, is_run
 from xplanes.training.record import read_config
 
 SCHEME = "hf://"
-"""What the address of a run on the hub begins with."""
+"""Prefix of the address of a run on the hub."""
 
 PATTERNS = (
     *("README.md", "config.yaml", "overrides.txt", "run.json", "metrics.json", "curve.csv"),
     *("checkpoints/*.ckpt", "media/*"),
 )
-"""Files of a run that the hub holds; logs stay, for they name folders and machines."""
+"""Files of a run that are uploaded; logs are not, since they name folders and machines."""
 
 PRIVATE = ("directory", "process")
-"""Keys of run.json that tell of the machine and are left out."""
+"""Keys of run.json that describe the machine and are not uploaded."""
 
 _ADDRESS = re.compile(r"(?P<repository>[\w.-]+/[\w.-]+)(?:@(?P<revision>[\w./-]+))?")
 
@@ -41,7 +41,7 @@ def push(
 
     Args:
         run: The run directory.
-        repository: USER/REPOSITORY; made if it does not exist.
+        repository: USER/REPOSITORY; created if it does not exist.
         private: Whether a new repository is private.
         say: Receives progress messages.
         endpoint: Address of the hub; the default when None.
@@ -100,12 +100,12 @@ def fetch(
     outputs: Path = OUTPUTS,
     endpoint: str | None = None,
 ) -> Path:
-    """Download a run, or what has changed of it since the last time.
+    """Download a run, or the files that have changed since its last download.
 
     Args:
         address: hf://USER/REPOSITORY, optionally with @REVISION.
         say: Receives a message before a download.
-        outputs: Where runs are kept; the run lies in hub/USER/REPOSITORY below.
+        outputs: Folder of runs; the run is saved in its subfolder hub/USER/REPOSITORY.
         endpoint: Address of the hub; the default when None.
 
     Returns:
@@ -124,9 +124,9 @@ def fetch(
         if not is_run(run):
             raise ConfigError(
                 f"{address} cannot be read: {server} cannot be reached, or HF_HUB_OFFLINE is set, "
-                f"and {run} holds no copy of an earlier time"
+                f"and {run} holds no earlier copy"
             )
-        say(f"offline     {run} is used as it was fetched before")
+        say(f"offline     using the earlier copy in {run}")
         return run
     say(f"fetching    {address} to {run}")
     try:
@@ -200,17 +200,17 @@ To use it:
     xplanes render {SCHEME}{repository}
     xplanes export {SCHEME}{repository} --what web
 
-These commands read the scene, which is not part of this repository: it must lie where `data.root`
-in `config.yaml` says (the demo scene is rendered where it is missing). In Python,
+These commands read the scene, which is not part of this repository: it must be in the folder
+`data.root` of `config.yaml` (the demo scene is rendered if it is missing). In Python,
 `RadianceModule.load_from_checkpoint("checkpoints/last.ckpt")` needs no scene.
 """
 
 
 def _weights(lrm: dict[str, Any]) -> str:
-    """The card's line on the weights that training began with, and their licence."""
+    """The card's sentence on the initial weights and their licence."""
     name = lrm["name"]
     if name == "none":
-        return "Training began with random initialisation: no weights of others are part of it."
+        return "Training began with random initialisation: the field has no third-party weights."
     if (licence := lrm.get("licence")) is not None:
         return (
             f"Training began with the LRM `{name}` ({lrm['repository']}), whose weights have the "

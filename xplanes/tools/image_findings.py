@@ -1,4 +1,4 @@
-"""What `xplanes inspect` finds in the pixels of images: masks, silhouettes, the cube."""
+"""Warnings of `xplanes inspect` from the pixels of images: masks, silhouettes, the cube."""
 
 import hashlib
 import math
@@ -24,22 +24,22 @@ from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene, Views, spread
 
 COARSE = 8.0
-"""Image pixels per texel above which planes resolve far less than the images show."""
+"""Image pixels per texel above which planes lose much of the images' detail."""
 
 CUT = 0.02
-"""Share of the foreground that may lie outside of the cube."""
+"""Share of the foreground outside of the cube above which a warning is given."""
 
 PALE = 0.15
-"""Share of a silhouette that may look like the background."""
+"""Share of the silhouettes with the background's colour above which a warning is given."""
 
 EMPTY = 1e-3
 """Share of opaque pixels below which an image is almost empty."""
 
 FULL = 0.98
-"""Share of opaque pixels above which a mask hides nothing."""
+"""Share of opaque pixels above which a mask hides almost nothing."""
 
 MOST_VIEWS = 300
-"""Most images of a split that are read, spread evenly."""
+"""Most images that are read per split, evenly spaced."""
 
 MOST_RAYS = 4096
 """Most foreground pixels of an image whose rays are tested against the cube."""
@@ -50,16 +50,16 @@ class ImageFacts:
     """Statistics of the pixels of one image.
 
     Attributes:
-        index: Number of the image in its split.
-        file: Its name.
-        coverage: Share of the pixels that are opaque.
-        border: The same along the image's edges.
-        middle: The same in the middle, a tenth as wide and high as the image.
-        pale_edge: Share of the opaque pixels next to transparent ones that look like the
-            background; None where there are too few to say.
+        index: Index of the image in its split.
+        file: Name of the image.
+        coverage: Share of opaque pixels.
+        border: Share of opaque pixels along the image's edges.
+        middle: Share of opaque pixels in the middle, a tenth as wide and high as the image.
+        pale_edge: Share of pixels with the background's colour among the opaque pixels next to
+            transparent ones; None if these are too few.
         outside: Share of the foreground whose rays miss the cube.
-        stray: Pixels with alpha away from the silhouette.
-        digest: Hash of the pixels; None where all are alike.
+        stray: Number of pixels with alpha far from the silhouette.
+        digest: Hash of the pixels; None if all pixels are equal.
     """
 
     index: int
@@ -74,12 +74,12 @@ class ImageFacts:
 
 
 def image_facts(views: Views, background: Tensor, frame: Frame | None) -> list[ImageFacts]:
-    """Statistics of the pixels of a split's images, of at most `MOST_VIEWS` of them.
+    """Statistics of the pixels of at most `MOST_VIEWS` images of a split.
 
     Args:
-        views: The images.
-        background: Colour behind the scene, from 0 to 1. [3]
-        frame: The field's frame; None where the cameras see no common volume.
+        views: The views of the split.
+        background: Background colour, from 0 to 1. [3]
+        frame: The field's frame; None if the cameras see no common volume.
     """
     chosen = spread(MOST_VIEWS, len(views))
     return [_facts_of(views, index, background, frame) for index in chosen]
@@ -98,7 +98,7 @@ def _facts_of(views: Views, index: int, background: Tensor, frame: Frame | None)
     rim = max(1, round(0.02 * min(height, width)))
     ring[rim : height - rim, rim : width - rim] = False
     rows, columns = (slice(round(0.45 * n), round(0.55 * n) + 1) for n in (height, width))
-    # Half-transparent pixels lie between, so that the opaque ones are two pixels away.
+    # Two pixels away, since semi-transparent pixels lie between opaque and transparent ones.
     near_clear = F.max_pool2d(clear.float()[None], 5, stride=1, padding=2)[0] > 0
     edge = near_clear & (alpha >= 250)
     uniform = bool((image == image[0, 0]).all())
@@ -131,14 +131,14 @@ def _outside(views: Views, index: int, opaque: Tensor, frame: Frame) -> float:
 
 
 def image_findings(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iterator[Finding]:
-    """Problems that the images' pixels show."""
+    """Findings from the images' pixels."""
     seen = [each for split in images.values() for each in split]
     masks = list(_masks(seen))
     yield from masks
     yield from _shared_images(scene, images)
     yield from stray_finding([(each.file, each.stray) for each in seen])
     if masks:
-        return  # Silhouettes mean little then.
+        return  # Silhouettes are unreliable with such masks.
     transparent = [each for each in seen if each.coverage < FULL]
     if 2 * len(transparent) > len(seen):
         yield from _white_edges(transparent)
@@ -146,7 +146,7 @@ def image_findings(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iter
         if share > CUT:
             yield Finding(
                 "cut",
-                f"the cube cuts off {share:.0%} of the foreground: nothing is shown outside of it. "
+                f"the cube cuts off {share:.0%} of the foreground: the field is empty outside it. "
                 "Raise data.half_side, or mask what does not belong to the scene",
             )
         return
@@ -154,12 +154,12 @@ def image_findings(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iter
 
 
 def texel_findings(per_texel: float, native: int, wide: int, resolution: int) -> Iterator[Finding]:
-    """Whether the images show far more than planes resolve.
+    """Warn if the images have far more detail than the planes can represent.
 
     Args:
-        per_texel: Image pixels that a texel of the planes covers, see `pixels_across`.
+        per_texel: Image pixels per texel of the planes, see `pixels_across`.
         native: Width of these images.
-        wide: Width of those that are trained on.
+        wide: Width of the images in training.
         resolution: Texels along an axis of the planes.
     """
     per_texel *= wide / native
@@ -168,14 +168,14 @@ def texel_findings(per_texel: float, native: int, wide: int, resolution: int) ->
         finer = 2 ** round(math.log2(resolution * per_texel / (0.5 * COARSE)))
         yield Finding(
             "texels",
-            f"a texel of planes with {resolution} texels a side covers {per_texel:.0f} pixels of "
-            f"images {wide} pixels wide. Set data.resolution={width}, which costs nothing "
-            f"that the planes could show, or give the planes {finer}",
+            f"a texel of planes with {resolution} texels per side covers {per_texel:.0f} pixels of "
+            f"images {wide} pixels wide. Set data.resolution={width}, which loses no detail "
+            f"that the planes could represent, or give the planes {finer} texels per side",
         )
 
 
 def _shared_images(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iterator[Finding]:
-    """Scored views whose pixels are those of a training view with another camera or file."""
+    """Scored views with the same pixels as a training view of another camera."""
     if any(shared(scene)):
         return
     train = scene.splits["train"]
@@ -184,7 +184,7 @@ def _shared_images(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iter
         poses, found = scene.splits[split].camera_to_world, []
         for each in images[split]:
             other = known.get(each.digest or b"")
-            # One camera shows the same again as long as nothing moves.
+            # Images of one pose may be equal, if nothing moves.
             if other is not None and not torch.equal(
                 poses[each.index], train.camera_to_world[other]
             ):
@@ -199,7 +199,7 @@ def _masks(images: Sequence[ImageFacts]) -> Iterator[Finding]:
     if len(empty) > 0.05 * count:
         yield Finding(
             "empty",
-            f"{len(empty)} of {count} images show next to nothing (under {EMPTY:.1%} of their "
+            f"{len(empty)} of {count} images show almost nothing (under {EMPTY:.1%} of their "
             f"pixels are opaque), such as {empty[0]}. Check alpha and masks, or leave them out",
         )
     inverted = [e for e in images if e.border > 0.9 and e.middle < 0.1 and 0.3 < e.coverage < 1]

@@ -1,4 +1,4 @@
-"""`xplanes inspect`: what is read of a capture, as a table and a picture, with warnings."""
+"""`xplanes inspect`: reads a capture and describes it in a table, with warnings."""
 
 import functools
 import math
@@ -32,10 +32,10 @@ from xplanes.tools.image_findings import ImageFacts, image_facts, image_findings
 from xplanes.tools.tabulate import markdown
 
 CONSEQUENCES = {"scale": ("cut", "texels"), "astray": ("cut",)}
-"""Findings that merely follow from another one."""
+"""Findings that are consequences of another one, and not shown with it."""
 
 NATIVE = "data.resolution=null"
-"""The setting that takes images at their native size."""
+"""The setting that reads images at their native size."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Choice:
     """The settings with which a capture is read.
 
     Attributes:
-        overrides: Settings of train.py that read the same.
+        overrides: Settings of train.py that read the same capture.
         scene: The settings of the scene.
-        model: Those of the model, for the field's frame and its planes.
-        usual_width: Width of the images that the format's YAML file sets, where they are taken at
-            their native size although nobody asked for it; None elsewhere.
+        model: The settings of the model, for the field's frame and the resolution of its planes.
+        usual_width: Width of the images in the format's YAML file, if the native size is read by
+            default instead; None otherwise.
     """
 
     overrides: tuple[str, ...]
@@ -61,12 +61,12 @@ class Capture:
     """A capture that was read.
 
     Attributes:
-        choice: What it was read with.
-        scene: What was read.
-        frame: The field's frame; None where none can be found.
-        problem: Why none can be found; empty where one was.
-        images: What the pixels of each split's images tell.
-        findings: What may be wrong.
+        choice: The settings with which it was read.
+        scene: The scene.
+        frame: The field's frame; None if it cannot be determined.
+        problem: Why the frame cannot be determined; empty if it can.
+        images: Statistics of the pixels of each split's images.
+        findings: Possible problems.
         texels: Texels along an axis of the planes; None for fields without planes.
     """
 
@@ -81,12 +81,12 @@ class Capture:
 
 @dataclass(frozen=True)
 class CameraGroup:
-    """The views of one physical camera, as far as poses and lenses tell.
+    """The views of one physical camera, judged by poses and lenses.
 
     Attributes:
-        name: Their folder where it tells cameras apart, or a number.
-        indices: Numbers of the views.
-        fixed: Whether it is static.
+        name: Folder of the views if it distinguishes the cameras, else a number.
+        indices: Indices of the views.
+        fixed: Whether the camera is static.
     """
 
     name: str
@@ -95,15 +95,15 @@ class CameraGroup:
 
 
 def choose(arguments: Sequence[str]) -> Choice:
-    """The settings of a capture: of the format that a folder is recognised as, or those given.
+    """The settings of a capture, from the command line or from the format of a folder.
 
     Args:
-        arguments: A folder, whose images are then taken at their native size; settings of train.py;
-            or both.
+        arguments: A folder, whose images are read at their native size by default; settings of
+            train.py; or both.
 
     Raises:
-        ConfigError: If the settings cannot work, or several formats fit.
-        SceneError: If there is no such folder, or no format fits.
+        ConfigError: If the settings are invalid, or several formats match.
+        SceneError: If there is no such folder, or no format matches.
     """
     usual_width = None
     changed, folders = settings_and_paths(arguments)
@@ -136,7 +136,7 @@ def _settings(overrides: Sequence[str]) -> tuple[SceneSettings, ModelSettings]:
 
 
 def _place(folder: Path) -> list[str]:
-    """Where a scene is, as settings."""
+    """Settings for the location of a scene."""
     return [f"data.root={quoted(str(folder.parent))}", f"data.scene={quoted(folder.name)}"]
 
 
@@ -148,7 +148,7 @@ def _target(option: str, *search: str) -> str:
 
 
 def _recognised(folder: Path, changed: Sequence[str]) -> tuple[Path, str]:
-    """The folder of a scene, or the only one in it, and the option of ``data`` for its format."""
+    """The folder of a scene, or its only subfolder with one, and the ``data`` option to read it."""
     search = [text for text in changed if text.startswith(("hydra.searchpath=", "plugins="))]
     modules = compose_plain("train", search).get("plugins") or []
     search = [text for text in search if text.startswith("hydra.")]
@@ -174,14 +174,14 @@ def _recognised(folder: Path, changed: Sequence[str]) -> tuple[Path, str]:
     there = [f"{path.name}{'/' * path.is_dir()}" for path in folder.iterdir()]
     wanted = "; ".join(f"{name}: {cls.files}" for cls, name in known.items() if cls.files)
     raise SceneError(
-        f"{folder} is no scene of a known format.{scenes} It holds "
-        f"{some(sorted(there)) or 'nothing'}. What the formats need: {wanted}. data=NAME chooses "
-        "one"
+        f"{folder} is no scene of a known format.{scenes} It contains "
+        f"{some(sorted(there)) or 'nothing'}. What the formats need: {wanted}. Choose one with "
+        "data=NAME"
     )
 
 
 def inspect(choice: Choice) -> Capture:
-    """Read a capture and check all of it.
+    """Read a capture and check it.
 
     Raises:
         SceneError: If it cannot be used.
@@ -211,9 +211,9 @@ def inspect(choice: Choice) -> Capture:
 
 
 def cameras_of(views: Views) -> list[CameraGroup]:
-    """The views by camera: fixed ones by their poses, others by their lenses.
+    """Group views by camera: fixed cameras by pose, moving ones by calibration.
 
-    Cameras count as fixed where each pose has two views or more on average.
+    Cameras count as fixed if each pose has two views or more on average.
     """
     poses: dict[Any, list[int]] = {}
     for index, pose in enumerate(views.camera_to_world):
@@ -232,7 +232,7 @@ def cameras_of(views: Views) -> list[CameraGroup]:
 
 
 def lens_words(views: Views) -> str:
-    """The kinds of lenses, with the coefficients that they have."""
+    """The kinds of lenses, with the names of their coefficients that are not 0."""
     lenses = views.intrinsics.lenses
     if lenses is None:
         return "pinhole"
@@ -249,10 +249,10 @@ def lens_words(views: Views) -> str:
 
 
 def distortion(views: Views) -> float:
-    """How far distortion moves the images' corners at most, in pixels.
+    """Largest displacement of the images' corners by distortion, in pixels.
 
-    Fisheye lenses are compared with an equidistant one, others with a pinhole. Corners that no
-    direction belongs to are left out.
+    Fisheye lenses are compared with an equidistant one, others with a pinhole. Corners without a
+    ray are ignored.
     """
     intrinsics, largest = views.intrinsics, 0.0
     if intrinsics.lenses is None:
@@ -278,7 +278,7 @@ def distortion(views: Views) -> float:
 
 
 def field_of_view(views: Views) -> tuple[float, float]:
-    """Angles in degrees between the middles of opposite edges, across and down; the first view."""
+    """Horizontal and vertical field of view of the first view, in degrees."""
     height, width = views.size(0)
     rows = torch.tensor([height / 2 - 0.5] * 2 + [-0.5, height - 0.5], dtype=torch.float64)
     columns = torch.tensor([-0.5, width - 0.5] + [width / 2 - 0.5] * 2, dtype=torch.float64)
@@ -290,7 +290,7 @@ def field_of_view(views: Views) -> tuple[float, float]:
 
 
 def facts(capture: Capture) -> dict[str, Any]:
-    """What was read, as builtins for JSON: lengths in world units, sizes as height and width."""
+    """The capture as builtins for JSON: lengths in world units, sizes as height and width."""
     scene, frame = capture.scene, capture.frame
     train = scene.splits["train"]
     splits = {name: _split_facts(v, capture.images[name]) for name, v in scene.splits.items()}
@@ -324,7 +324,7 @@ def facts(capture: Capture) -> dict[str, Any]:
 
 
 def _rounded(value: float, frame: Frame) -> float:
-    """A coordinate to a millionth of the cube's size: rounding errors show as 0."""
+    """A coordinate, rounded to about a millionth of the cube's size, so that noise becomes 0."""
     return round(value * frame.scale, 6) / frame.scale + 0.0
 
 
@@ -353,7 +353,7 @@ def _split_facts(views: Views, images: Sequence[ImageFacts]) -> dict[str, Any]:
 
 
 def table(capture: Capture) -> str:
-    """What was read, as text."""
+    """The capture as text."""
     known = facts(capture)
     splits = {split: _split_rows(each) for split, each in known["splits"].items()}
     lines = [[name, *(rows[name] for rows in splits.values())] for name in splits["train"]]
@@ -369,7 +369,7 @@ def table(capture: Capture) -> str:
     if known["static_reason"]:
         text.append(f"static  {known['static_reason']}")
     elif known["splits"]["train"]["timesteps"] == 1:
-        text.append("static  all training views have one time, so nothing can move")
+        text.append("static  all training views have the same time, so nothing can move")
     if (cube := known["cube"]) is not None:
         centre = ", ".join(f"{value:.3g}" for value in cube["centre"])
         near, middle, far = cube["camera_distance"]
@@ -379,7 +379,7 @@ def table(capture: Capture) -> str:
         )
     if known["pixels_per_texel"] is not None:
         text.append(
-            f"texels  {known['texels']} a side of the finest planes: each covers "
+            f"texels  {known['texels']} per side of the finest planes: each covers "
             f"{known['pixels_per_texel']:.1f} image pixels at the centre of the cube"
         )
     warned = [f"warning ({each.kind})  {each.text}" for each in capture.findings]
@@ -413,7 +413,7 @@ def _split_rows(each: Mapping[str, Any]) -> dict[str, str]:
 
 
 def next_command(capture: Capture) -> str:
-    """The command that trains on the capture, at the usual width where images are wider."""
+    """The command that trains on the capture, at the format's default width if images are wider."""
     overrides = [*capture.choice.overrides]
     if width := _width_of_training(capture.choice, capture.scene):
         overrides = [f"data.resolution={width}" if text == NATIVE else text for text in overrides]
@@ -421,23 +421,23 @@ def next_command(capture: Capture) -> str:
 
 
 def _width_of_training(choice: Choice, scene: Scene) -> int | None:
-    """The usual width, if nobody asked for another and all images are wider."""
+    """The format's default width, if none was set and all images are wider."""
     sizes = torch.cat([views.intrinsics.size for views in scene.splits.values()])
     width = choice.usual_width
     return width if width is not None and width < int(sizes[:, 1].min()) else None
 
 
 def check_out(out: Path, settings: SceneSettings) -> None:
-    """Refuse to write the picture where it cannot or must not be.
+    """Check the file of the picture.
 
     Raises:
-        ConfigError: If it is no PNG, or lies in the folder of the scene.
+        ConfigError: If it is no PNG, or is in the folder of the scene.
     """
     if out.suffix.lower() != ".png":
         raise ConfigError(f"--out {out}: must end in .png")
     folder = settings.folder.resolve()
     if out.resolve().is_relative_to(folder):
         raise ConfigError(
-            f"--out {out}: lies in the scene's own folder {folder}, where nothing is written. Name "
-            "another place"
+            f"--out {out}: is in the scene's own folder {folder}, where nothing is written. Choose "
+            "another folder"
         )

@@ -18,7 +18,7 @@ from xplanes.tools.inspect import CameraGroup, Capture, cameras_of
 
 WIDTH, HEIGHT, MARGIN = 1600, 960, 24
 SCALE = 2
-"""Factor by which the picture is drawn larger and then reduced: lines and letters become smooth."""
+"""Supersampling factor of the picture, for anti-aliased lines and letters."""
 
 INK, FAINT, PAPER, PANEL = "#1f2933", "#9aa5b1", "#ffffff", "#f5f7fa"
 SPLITS = {"train": "#2b6cb0", "val": "#d97706", "test": "#2f855a"}
@@ -27,21 +27,21 @@ POINT = "#627d98"
 MOST_FRUSTA, MOST_RAYS, MOST_STRIPS, SAMPLES = 80, 3, 12, 6
 MOST_POINTS = 3000
 EDGE_POINTS = 48
-"""Points along an edge of the cube, which a lens may bend."""
+"""Points along an edge of the cube; distortion makes edges curved."""
 
 Box = tuple[float, float, float, float]
 """Left, top, right and bottom, in pixels of the finished picture."""
 
 
 def write_picture(path: Path, capture: Capture) -> None:
-    """Draw a capture to a PNG file, whole or not at all."""
+    """Draw a capture to a PNG file, written atomically."""
     picture = draw(capture)
     with replacing(path) as temporary:
         picture.save(temporary, format="PNG")
 
 
 def draw(capture: Capture) -> Image.Image:
-    """A capture as a picture."""
+    """Draw a capture."""
     sheet = _Sheet(WIDTH, HEIGHT)
     scene = capture.scene
     sheet.text((MARGIN, 16), scene.name, size=26)
@@ -58,7 +58,7 @@ def draw(capture: Capture) -> Image.Image:
 
 
 class _Sheet:
-    """A picture that is drawn in pixels of its final size, and finer."""
+    """A supersampled canvas, with coordinates in pixels of the final picture."""
 
     def __init__(self, width: int, height: int) -> None:
         self.size = (width, height)
@@ -90,7 +90,7 @@ class _Sheet:
         anchor: str = "la",
         room: float | None = None,
     ) -> float:
-        """Write a line, shortened in the middle to ``room`` pixels; gives its width."""
+        """Write a line, shortened in the middle to ``room`` pixels, and return its width."""
         font = ImageFont.load_default(SCALE * size)
         whole, kept = text, len(text)
         while room is not None and kept > 2 and font.getlength(text) > SCALE * room:
@@ -132,7 +132,7 @@ def _legend(sheet: _Sheet, capture: Capture) -> None:
 
 
 class _Plan:
-    """World points in a panel, seen along an axis from afar."""
+    """Orthographic projection of world points to a panel."""
 
     def __init__(self, box: Box, axes: str, points: Tensor) -> None:
         self.columns = ["xyz".index(name) for name in axes]
@@ -152,7 +152,7 @@ class _Plan:
 def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
     """Cameras with their frusta, points, the cube, and rays through the corners of some images.
 
-    They have a sheet of their own, since rays leave the panel.
+    They are drawn on a separate sheet, which clips rays at the panel's border.
     """
     sheet = _Sheet(side, side)
     sheet.box((0, 0, side, side), fill=PANEL)
@@ -201,7 +201,7 @@ def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
 
 
 def _corners(views: Views, index: int, reach: float) -> Tensor:
-    """Points at a distance on the rays through an image's corners, around the image. [4, 3]"""
+    """Points at distance ``reach`` on the rays through an image's corners, in order. [4, 3]"""
     height, width = views.size(index)
     rows = torch.tensor([-0.5, -0.5, height - 0.5, height - 0.5])
     columns = torch.tensor([-0.5, width - 0.5, width - 0.5, -0.5])
@@ -221,7 +221,7 @@ def _cube_edges(frame: Frame) -> Tensor:
 
 
 def _strips(capture: Capture) -> list[tuple[str, str, list[float]]]:
-    """Split, label and times of each strip; cameras for which there is no room share the last."""
+    """Split, label and times of each strip; the last one combines cameras beyond the limit."""
     found = []
     for split, views in capture.scene.splits.items():
         groups = cameras_of(views)
@@ -263,7 +263,7 @@ def _times(sheet: _Sheet, box: Box, capture: Capture) -> None:
 
 
 def _coverage(sheet: _Sheet, box: Box, capture: Capture) -> None:
-    """How much of each image is opaque."""
+    """The share of opaque pixels of each image."""
     left, top, right, bottom = box
     sheet.box(box, fill=PANEL)
     sheet.text((left + 12, top + 8), "opaque pixels of each view", size=15)
@@ -282,7 +282,7 @@ def _coverage(sheet: _Sheet, box: Box, capture: Capture) -> None:
 
 
 def _samples(sheet: _Sheet, box: Box, capture: Capture) -> None:
-    """Some images with the cube's edges in front."""
+    """Some images with the cube's edges."""
     left, top, right, bottom = box
     chosen = _chosen(capture)
     cell = (right - left - (SAMPLES - 1) * 12) / SAMPLES
@@ -302,7 +302,7 @@ def _samples(sheet: _Sheet, box: Box, capture: Capture) -> None:
 
 
 def _chosen(capture: Capture) -> list[tuple[str, int]]:
-    """Views to show: training views over the times, and one of each other split."""
+    """Views to show: training views spread over the times, and one of each other split."""
     splits = capture.scene.splits
     others = [(split, len(views) // 2) for split, views in splits.items() if split != "train"]
     train = splits["train"]
@@ -313,18 +313,18 @@ def _chosen(capture: Capture) -> list[tuple[str, int]]:
 
 
 def _sample(views: Views, index: int, size: tuple[int, int], frame: Frame | None) -> Image.Image:
-    """An image in front of a chequered ground, with the edges of the cube as its lens shows them.
+    """An image on a chequerboard, with the edges of the cube projected by its lens.
 
     Args:
-        views: The images.
-        index: Which of them.
+        views: The views.
+        index: Index of the view.
         size: Width and height in pixels of the finished picture.
         frame: The field's frame.
     """
     height, width = views.size(index)
     wide, high = SCALE * size[0], SCALE * size[1]
     pixels = views.image(index).numpy()
-    # Pillow would multiply the colours of an RGBA image by alpha, which they are already.
+    # The colours are already multiplied by alpha; Pillow would multiply those of RGBA again.
     parts = [Image.fromarray(part.copy()) for part in (pixels[..., :3], pixels[..., 3])]
     smooth = Image.Resampling.BOX if width > wide else Image.Resampling.NEAREST
     colour, alpha = (
@@ -339,7 +339,7 @@ def _sample(views: Views, index: int, size: tuple[int, int], frame: Frame | None
     pen, edges = ImageDraw.Draw(image), _cube_edges(frame)
     x, y, seen = pixels_of(views, index, edges.flatten(0, 1))
     places = torch.stack([x * wide / width, y * high / height], dim=1).view(*edges.shape[:2], 2)
-    # Beyond the picture by far, Pillow's coordinates overflow.
+    # Pillow's coordinates overflow far outside of the picture.
     near = seen.view(edges.shape[:2]) & (places.abs().amax(dim=-1) < 20 * max(wide, high))
     for ink, thick in ((PAPER, 3.2), (CUBE, 1.6)):
         for edge, shown in zip(places.tolist(), near.tolist(), strict=True):

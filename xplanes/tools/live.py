@@ -1,4 +1,4 @@
-"""The viewer of a field that is training: `viewer=true`."""
+"""The viewer of a field in training: `viewer=true`."""
 
 import logging
 import math
@@ -18,7 +18,7 @@ from xplanes.training.module import RadianceModule
 logger = logging.getLogger(__name__)
 
 PATIENCE = 1.0
-"""Seconds that training waits for a picture at most; longer if its last step took longer."""
+"""Longest time in seconds that training waits for a picture, or the last step's if longer."""
 
 TOLD_SECONDS = 0.5
 """Seconds between two updates of the status line."""
@@ -57,8 +57,8 @@ class LiveViewer(Callback):
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         if self.enabled and trainer.world_size > 1:
             raise ConfigError(
-                f"viewer=true with trainer.devices={trainer.world_size}: a viewer shows a field "
-                "that one process trains; leave one of them out"
+                f"viewer=true with trainer.devices={trainer.world_size}: the viewer needs training "
+                "in a single process; leave one of them out"
             )
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -86,7 +86,7 @@ class LiveViewer(Callback):
         with off_clock(trainer):
             try:
                 self._serve(self.viewer, trainer, pl_module)
-            except RuntimeError as error:  # Such as a device without memory for a picture.
+            except RuntimeError as error:  # For example out of memory.
                 logger.warning("the viewer is closed, training goes on: %s", error)
                 self._close()
         self._drawn = time.monotonic()
@@ -96,7 +96,7 @@ class LiveViewer(Callback):
         if viewer.is_watched and time.monotonic() - self._told > TOLD_SECONDS:
             viewer.tell(status(trainer, module))
             self._told = time.monotonic()
-        # For as long as the step took: a camera need not wait for a step at each picture.
+        # Render for as long as the last step took, so that a moving camera gets several pictures.
         stepped = time.monotonic() - self._drawn
         viewer.patience = max(PATIENCE, stepped)
         viewer.catch_up(stepped)

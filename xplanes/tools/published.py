@@ -1,4 +1,4 @@
-"""Published figures beside a sweep's own: read from a table that names their sources."""
+"""Compares the results of a sweep with published ones, which published.csv lists with sources."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from xplanes.tools.sweep import RunRow
 from xplanes.tools.tabulate import differing, markdown, mean, mean_part
 
 KEYS = {"model": "model.name", "lrm": "lrm.name", "sampler": "model.sampler.name"}
-"""Settings that runs are told apart by, and their columns in the file."""
+"""Columns of published.csv, and the settings that must match them."""
 
 MEANT = ("data.scene", "seed")
 """Settings over which means are taken."""
@@ -22,15 +22,15 @@ Entry = dict[str, str]
 
 
 def read_published() -> list[Entry]:
-    """The published figures: D-NeRF's data, test split, 400 pixels."""
+    """The published results, on D-NeRF's test split at 400 pixels."""
     return read_rows(Path(__file__).with_name("published.csv"))
 
 
 def check_published(names: object) -> list[str]:
-    """Names of published tables.
+    """Check names of published tables, and return them.
 
     Raises:
-        ConfigError: If it is not a list of names in the file.
+        ConfigError: If ``names`` is not a list of names of tables in published.csv.
     """
     known = list(dict.fromkeys(entry["table"] for entry in read_published()))
     if not isinstance(names, list) or any(name not in known for name in names):
@@ -41,17 +41,17 @@ def check_published(names: object) -> list[str]:
 
 
 def beside(rows: Sequence[RunRow], tables: Sequence[str] = ()) -> str | None:
-    """Means of a sweep's finished runs beside what was published.
+    """Compare means of a sweep's finished runs with published results.
 
-    Figures are set beside runs on D-NeRF's scenes with all views that agree in model, LRM, sampler
-    and, where they name it, the planes' resolution.
+    Published results are matched with runs on D-NeRF's scenes with all views by model, LRM, sampler
+    and, if they state it, the resolution of the planes.
 
     Args:
-        rows: The sweep.
-        tables: Published tables that are shown whole, whatever the data.
+        rows: Runs of the sweep.
+        tables: Published tables to show completely, whatever the data.
 
     Returns:
-        Text and tables in markdown; None where nothing was published of these models.
+        Text and tables in markdown; None if no published result matches.
     """
     entries = [e for e in read_published() if not tables or e["table"] in tables]
     scored = [entry for entry in entries if entry["psnr"]]
@@ -124,7 +124,7 @@ def _published(entry: Entry) -> list[str]:
 
 
 def _agrees(row: RunRow, entry: Entry) -> bool:
-    """Whether a run has the settings of a published figure, as far as that names them."""
+    """Whether a run has the settings of a published result, as far as they are stated."""
     settings = row.settings
     if settings.get("data.name") != "dnerf" or settings.get("data.views") is not None:
         return False

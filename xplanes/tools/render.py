@@ -1,4 +1,4 @@
-"""What `xplanes render` shows: the camera and the time of each frame, and where it is written."""
+"""`xplanes render`: the camera and the time of each frame, and the output file."""
 
 import difflib
 import math
@@ -34,10 +34,10 @@ from xplanes.tools.runs import TrainedRun
 from xplanes.training.module import RadianceModule
 
 OWN = "own"
-"""The time of a view, for its camera."""
+"""Value of ``--time`` for the time of the view that ``--path`` names."""
 
 LARGEST = 8192
-"""Pixels per side; WebP ends at twice as many."""
+"""Most pixels per side; WebP allows twice as many."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,13 @@ class VideoOptions:
             camera path, FILE.json.
         time: ``sweep`` (from 0 to 1), ``back-and-forth``, ``own`` (that of ``view:FILE``), or a
             number from 0 to 1; None for back-and-forth, or the times of a camera path.
-        frames: Number of frames; None for 48, for 1 where neither camera nor time moves, or for
-            those of a camera path.
-        fps: Frames per second; None for 16, or as a camera path says.
-        size: Pixels of the longer side; None for those of the training views, of the view that
-            ``path`` names, or as a camera path says. Frames of an orbit or a fixed camera are
-            square.
-        elevation: Height angle of orbit and fixed camera, in degrees.
+        frames: Number of frames; None for 48, for 1 if neither camera nor time moves, or for one
+            per camera of a camera path.
+        fps: Frames per second; None for 16, or the rate in the camera path.
+        size: Pixels of the longer side; None for the size of the training views, of the view that
+            ``path`` names, or the size in the camera path. Frames of an orbit or a fixed camera
+            are square.
+        elevation: Elevation of orbit and fixed camera, in degrees.
         what: ``colour`` or ``depth``.
     """
 
@@ -68,14 +68,14 @@ class VideoOptions:
     what: str = "colour"
 
     def written_to(self, out: str | None) -> "VideoOptions":
-        """These options where the frames go to ``out``: an image of a view shows its own time."""
+        """The options for output to ``out``: a single image of a view gets the view's time."""
         one = self.frames in (None, 1) and self.path.startswith("view:") and self.time is None
         image = out is not None and Path(out).suffix in IMAGES and not Path(out).is_dir()
         return replace(self, time=OWN) if one and image else self
 
     @cached_property
     def cameras(self) -> CameraPath | None:
-        """The camera path that is named, read from its file; None where none is.
+        """The camera path, read from its file; None if ``path`` is another kind of camera.
 
         Raises:
             SceneError: If it cannot be used.
@@ -103,14 +103,14 @@ class VideoOptions:
         """Time of each frame, from 0 to 1. [F]
 
         Raises:
-            ConfigError: As `times`, and for ``own``, which only a scene can tell.
+            ConfigError: As `times`, and for ``own``, which needs a scene.
         """
         if self.cameras is not None and self.time is None:
             return self.cameras.times
         return times(self.time or "back-and-forth", self.count)
 
     def shape(self, splits: dict[str, Views]) -> tuple[int, int]:
-        """Rows and columns of a frame of a scene with these splits.
+        """Rows and columns of a frame, for a scene with these splits.
 
         Raises:
             ConfigError: As `find_view`.
@@ -126,12 +126,12 @@ class VideoOptions:
         return max(1, round(height * scale)), max(1, round(width * scale))
 
     def view(self, splits: dict[str, Views]) -> tuple[Views, int] | None:
-        """The view that is named, as `find_view` gives it; None where none is."""
+        """The view that ``path`` names, see `find_view`; None for other kinds of cameras."""
         name = self.path.removeprefix("view:")
         return None if name == self.path else find_view(splits, name)
 
     def check(self) -> None:
-        """Refuse options that cannot be rendered.
+        """Check the options without a run.
 
         Raises:
             ConfigError: With the option, its value and what is allowed.
@@ -141,7 +141,7 @@ class VideoOptions:
         if self.time != OWN:
             times(self.time or "back-and-forth", 1)
         elif not views:
-            raise ConfigError(f"--time {OWN}: only the camera of a view has one, --path view:FILE")
+            raise ConfigError(f"--time {OWN}: is a view's own time and needs --path view:FILE")
         if self.path not in ("orbit", "fixed") and not views and self.cameras is None:
             raise ConfigError(
                 f"--path {self.path}: must be orbit, fixed, view:FILE or a camera path, FILE.json"
@@ -149,7 +149,7 @@ class VideoOptions:
         if self.cameras is not None and self.frames is not None:
             raise ConfigError(
                 f"--frames {self.frames}: {self.path} has {self.count} cameras, and each of them "
-                "is one frame; leave --frames out"
+                "gives one frame; leave --frames out"
             )
         require_between("--frames", self.count, 1, 100_000)
         require_between("--fps", self.fps, 1, 240)
@@ -169,8 +169,8 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
     Args:
         trained: The run.
         options: What to render.
-        out: A file (.webp, .mp4, .png, .jpg), or a folder if it ends in /; by default a file in the
-            run's media/ that is named after the paths.
+        out: A file (.webp, .mp4, .png, .jpg), or a folder if it ends in /; None for a file in the
+            run's media/ that is named after the options.
 
     Returns:
         The file or folder that was written.
@@ -202,7 +202,7 @@ def _frames(module: RadianceModule, scene: Scene, options: VideoOptions) -> Iter
 
 
 def check_out(out: str | None, options: VideoOptions) -> None:
-    """Refuse an ``--out`` that could not be written, before the run is loaded.
+    """Check ``--out`` before the run is loaded.
 
     Raises:
         ConfigError: As `check_video`.
@@ -232,7 +232,7 @@ def destination(
 def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> list[PosedCamera]:
     """The camera of each frame.
 
-    That of a view shows exactly what the view shows; the others show as much as the training views.
+    A view's camera keeps its distortion and principal point. An orbit has the views' field of view.
     """
     rows, columns = options.shape(splits)
     if (path := options.cameras) is not None:
@@ -253,7 +253,7 @@ def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> li
 
 
 def pixels_with_rays(options: VideoOptions, splits: dict[str, Views]) -> Tensor | None:
-    """Pixels of a frame that its lens has rays for; None for all. bool [rows, columns]"""
+    """Pixels of a frame for which its lens has rays; None for all. bool [rows, columns]"""
     if (found := options.view(splits)) is None:
         return None
     views, index = found
@@ -264,10 +264,10 @@ def pixels_with_rays(options: VideoOptions, splits: dict[str, Views]) -> Tensor 
 
 
 def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:
-    """The view whose file is called ``name``, with or without ending: its split and its number.
+    """Find the view with a file name, with or without extension: the views of its split, its index.
 
     Raises:
-        ConfigError: If there is none, with similar names.
+        ConfigError: If there is no such view, with similar names.
     """
     known = {file: (v, index) for v in splits.values() for index, file in enumerate(v.files)}
     for file, found in known.items():

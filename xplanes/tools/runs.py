@@ -1,4 +1,4 @@
-"""Run directories: finding them, and loading them as trained scenes."""
+"""Run directories: finding them, and loading their scene and trained field."""
 
 import difflib
 from collections.abc import Callable, Sequence
@@ -30,9 +30,9 @@ class TrainedRun:
 
     Attributes:
         path: The run directory.
-        experiment: Its settings.
-        scene: The training views and one split beside them.
-        split: Name of that split.
+        experiment: The settings.
+        scene: The scene, with the training views and one more split.
+        split: Name of the other split.
         frame: The field's frame.
         module: The trained module, in evaluation mode.
         checkpoint: ``last`` or ``best``.
@@ -55,7 +55,7 @@ class TrainedRun:
 
     @property
     def is_static(self) -> bool:
-        """Whether the field has no time."""
+        """Whether the field is static."""
         return not self.module.field.moves
 
 
@@ -63,7 +63,7 @@ def find_run(path: Path, outputs: Path = OUTPUTS) -> Path:
     """Check that ``path`` is a run directory.
 
     Raises:
-        ConfigError: If it is not; the message lists runs with a similar name, or the newest.
+        ConfigError: If it is not one, with runs of similar names or the newest runs.
     """
     if is_run(path):
         return path
@@ -86,7 +86,7 @@ def find_run(path: Path, outputs: Path = OUTPUTS) -> Path:
 
 
 def is_run(path: Path) -> bool:
-    """Whether a folder holds a run, finished or not."""
+    """Whether a folder is a run directory, of a finished run or not."""
     return (path / "run.json").is_file() or (path / "config.yaml").is_file()
 
 
@@ -109,15 +109,15 @@ def load_run(
     plugins: Sequence[str] = (),
     announce: Callable[[str], None] | None = None,
 ) -> TrainedRun:
-    """Load a trained run, exactly as it was when the checkpoint was written.
+    """Load a trained run from a checkpoint.
 
     Args:
         run: The run directory.
         checkpoint: ``last`` or ``best``.
-        split: Split to score; the one that the run was scored on when None.
-        device: Where to put the field; as ``trainer.accelerator`` says when None.
-        plugins: Modules of the user's own whose classes the run may name.
-        announce: Takes the lines that say what is being loaded.
+        split: Split to read; None for the split of the run's final scores.
+        device: Device of the field; None to follow ``trainer.accelerator``.
+        plugins: User modules with classes that the run's settings may name.
+        announce: Receives messages about what is loaded.
 
     Raises:
         ConfigError, SceneError: If the run or its data are missing, damaged or changed.
@@ -137,7 +137,7 @@ def load_run(
         announce(f"run         {run}")
         announce(f"checkpoint  {checkpoint}.ckpt, step {step}, on {device}")
     served = SceneDataModule(data, seed=experiment.method.seed)
-    served.setup("fit")  # As before training: views may have been held out.
+    served.setup("fit")  # Holds out the same views as in training.
     name = split or served.test_split
     served.read_split(name)
     scene = served.scene
@@ -160,7 +160,7 @@ def read_experiment(run: Path, plugins: Sequence[str] = ()) -> Experiment:
 
     Args:
         run: The run directory.
-        plugins: Modules of the user's own whose classes they may name.
+        plugins: User modules with classes that the settings may name.
 
     Raises:
         ConfigError: If they are missing, damaged, or from another version.
@@ -183,7 +183,7 @@ def read_experiment(run: Path, plugins: Sequence[str] = ()) -> Experiment:
 
 
 def _record(run: Path) -> dict[str, Any]:
-    """run.json; empty if it is missing or damaged, since only messages need it here."""
+    """Content of run.json; empty if it is missing or damaged, since only messages use it."""
     try:
         return read_json(run / "run.json")
     except (OSError, ValueError):

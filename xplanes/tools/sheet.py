@@ -1,6 +1,6 @@
-"""Contact sheets of runs: one view as several runs show it, or as one run shows it step by step.
+"""Contact sheets of runs: renders of one view from several runs, or from several steps.
 
-Everything comes from the pictures that runs write while they train (``media/``).
+They consist of the pictures that runs write during training (``media/``).
 """
 
 import re
@@ -25,17 +25,17 @@ WHAT = ("runs", "steps", "parts")
 and sparse part of each run's triplanes."""
 
 LINE, GAP = 16, 4
-"""Pixels of a line of text, and between tiles."""
+"""Height of a line of text and gap between tiles, in pixels."""
 
 FPS, HELD = 2, 4
-"""Frames per second of a video, and how often its last one is shown."""
+"""Frames per second of a video, and how many times its last frame is repeated."""
 
 Line = tuple[str, Sequence[Image.Image]]
 """A row of tiles with its title."""
 
 _STEP = re.compile(r"step(\d+)")
 _TWICE = re.compile(r"^(train|val|test)_(?=\1_)")
-"""The split before a name that begins with it, as earlier runs wrote it."""
+"""A duplicated split at the beginning of a name, as earlier versions wrote it."""
 
 
 def write_sheet(
@@ -50,17 +50,17 @@ def write_sheet(
 ) -> Path:
     """Write a contact sheet of all runs in a folder.
 
-    With "runs", of runs that differ only in their seed the first is shown, unless all do.
+    With "runs", only the first of runs that differ in their seed alone is shown, unless all do.
 
     Args:
         folder: A run, a sweep, or any folder of runs.
-        out: The picture, a PNG, or for steps a video, a WebP with a frame per step;
+        out: A PNG file, or with "steps" also a WebP video with a frame per step;
             ``folder/sheet_WHAT.png`` when None.
         what: One of `WHAT`.
-        show: One of `xplanes.rendering.pictures.STRIP`: what is shown of a view.
-        view: Name of the view, as in ``media``, or an ending that no other view has; the middle
-            one of those that all runs of a scene show when None.
-        steps: Steps to show; all, or with "runs" the last, when None.
+        show: Quantity to show, one of `xplanes.rendering.pictures.STRIP`.
+        view: Name of the view, as in ``media``, or a unique ending of it; None for the middle one
+            of those that all runs of a scene have.
+        steps: Steps to show; None for all, or with "runs" for the last.
         size: Pixels of a tile's longer side.
 
     Raises:
@@ -73,7 +73,7 @@ def write_sheet(
             f"{out}: a contact sheet must end in .png, or with --what steps in .webp for a video"
         )
     if size < 16:
-        raise ConfigError(f"size={size}: a tile must have 16 pixels at least")
+        raise ConfigError(f"size={size}: a tile must have at least 16 pixels")
     rows = read_rows(folder)
     if what == "runs":
         rows = _one_seed(rows)
@@ -93,14 +93,14 @@ def write_sheet(
 
 
 def _one_seed(rows: list[RunRow]) -> list[RunRow]:
-    """Runs without those that repeat another one with a different seed, if settings differ too."""
+    """The runs, with one per setting if there are several seeds and several settings."""
     groups = seed_groups(rows)
     repeats = [row.name for group in groups if len(groups) > 1 for row in group[1:]]
     return [row for row in rows if row.name not in repeats]
 
 
 def check_what(what: str | None) -> None:
-    """Refuse a kind of sheet that there is not.
+    """Check a kind of sheet.
 
     Raises:
         ConfigError: If it is neither None nor one of `WHAT`.
@@ -121,7 +121,7 @@ def _parts(found: dict[Path, RunRow], over: Sequence[str]) -> list[Line]:
             lines.append((_title(row, over), [tile]))
     if not lines:
         raise ConfigError(
-            "no run has media/decomposition.png: only runs that an LRM initialises have one"
+            "no run has media/decomposition.png: only runs initialised from an LRM have one"
         )
     return lines
 
@@ -182,7 +182,7 @@ def _pictures(run: Path) -> dict[int, dict[str, Path]]:
 
 
 def _view(scene: str, runs: Sequence[dict[int, dict[str, Path]]], wanted: str | None) -> str:
-    """The view that all runs show at all of their steps."""
+    """The name of a view that all runs have at all steps."""
     common = set.intersection(*(set(named) for taken in runs for named in taken.values()))
     if not common:
         raise ConfigError(f"the runs of {scene} have no view in common: train them on equal data")
@@ -216,7 +216,7 @@ def _steps(
 
 
 def _part(strip: Image.Image, place: int, size: int) -> Image.Image:
-    """One picture of a strip, its longer side enlarged or reduced to ``size`` pixels."""
+    """One picture of a strip, resized to ``size`` pixels along its longer side."""
     width = strip.width // len(STRIP)
     tile = strip.crop((place * width, 0, (place + 1) * width, strip.height))
     factor = size / max(tile.size)
@@ -232,7 +232,7 @@ def _score(strip: Image.Image) -> float:
 
 
 def _video(lines: Sequence[Line]) -> Iterator[Image.Image]:
-    """Sheets of the truth beside one step after another; runs with fewer steps wait at the end."""
+    """Frames with ground truth and one step each; runs with fewer steps repeat their last one."""
     last = max(len(tiles) for _, tiles in lines) - 1
     for step in [*range(1, last), *[last] * HELD]:
         shown = [(title, [tiles[0], tiles[min(step, len(tiles) - 1)]]) for title, tiles in lines]
@@ -254,7 +254,7 @@ def _tile(picture: Image.Image, caption: str) -> Image.Image:
 
 
 def _assemble(lines: Sequence[Line], widest: int) -> Image.Image:
-    """Titled rows of tiles on white, in columns of equal width."""
+    """Arrange titled rows of tiles on white, in columns of equal width."""
     font, cell = ImageFont.load_default(11), widest + GAP
     heights = [LINE + max(tile.height for tile in tiles) + 2 * GAP for _, tiles in lines]
     wide = max(int(font.getlength(title)) + GAP for title, _ in lines)

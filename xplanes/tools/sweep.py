@@ -1,7 +1,7 @@
-"""Reads the runs of a sweep, whatever state they are in.
+"""Reads the runs of a sweep, including unfinished and damaged ones.
 
-Must stay quick, and a damaged file must not hide the other runs: every problem ends as a run's
-status.
+A damaged file must not prevent reading the other runs: every problem becomes part of a run's
+status. Reading must stay fast.
 """
 
 import itertools
@@ -44,16 +44,16 @@ SCORES = {
     "samples_per_ray": Score("samples/ray", ".1f", "samples_per_ray"),
     "parameters": Score("params", ",.0f", "parameters"),
 }
-"""Scores in the order of the columns; those without a place come from curve.csv."""
+"""Scores in the order of the columns; those without ``place`` are computed from curve.csv."""
 
 GOAL = 20.0
-"""PSNR that ``seconds_to_20`` stands for."""
+"""PSNR in dB for ``seconds_to_20``."""
 
 STATES = ("running", "finished", "failed", "interrupted")
 
 
 class Point(NamedTuple):
-    """A line of curve.csv: seconds of preparation and training, steps, mean PSNR of the views."""
+    """A line of curve.csv, with the seconds of preparation added; PSNR is a mean over views."""
 
     seconds: float
     step: int
@@ -62,18 +62,18 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class RunRow:
-    """One run, or one job of a sweep that left no run.
+    """One run, or one job of a sweep without a run directory.
 
     Attributes:
-        name: Folder of the run relative to the sweep's.
+        name: Folder of the run relative to the sweep's folder.
         settings: Settings by dotted name.
-        overridden: Names of those that the command line set.
-        scores: Numbers by the names of `SCORES` and those from the curve, as far as known.
-        status: How it ended, with the reason where it is not ``finished``.
-        curve: PSNR on the way.
-        split: The split that `scores` are of; empty where they do not say.
+        overridden: Names of settings from the command line.
+        scores: Known scores by the names of `SCORES`.
+        status: One of `STATES`, "damaged" or "missing", with the reason if it is not ``finished``.
+        curve: PSNR during training.
+        split: The split of `scores`; empty if unknown.
         parts: Report of the decomposition of each orientation, "xy", "xz" and "yz".
-        machine: Device and processor count; empty where run.json does not say.
+        machine: Device and processor count; empty if unknown.
     """
 
     name: str
@@ -88,20 +88,20 @@ class RunRow:
 
     @property
     def missing(self) -> bool:
-        """Whether the job left no run: only its overrides are known."""
+        """Whether the job has no run directory: only its overrides are known."""
         return self.status.startswith("missing")
 
     @property
     def done(self) -> bool:
-        """Whether it finished and has the scores that means are taken of."""
+        """Whether it finished and has PSNR and SSIM, so that it counts in means."""
         return self.status == "finished" and {"psnr", "ssim"} <= self.scores.keys()
 
 
 def read_rows(folder: Path) -> list[RunRow]:
-    """All runs in a folder, however deep, and the jobs of sweeps that left no run.
+    """All runs in a folder, at any depth, and the jobs of sweeps without a run directory.
 
     Raises:
-        ConfigError: If there are none, or no such folder.
+        ConfigError: If the folder does not exist or contains no runs.
     """
     if not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder")
@@ -115,7 +115,7 @@ def read_rows(folder: Path) -> list[RunRow]:
     known = {name for row in rows for name in row.settings if name.endswith(".name")}
 
     def full(key: str) -> str:
-        """What runs call the setting of a job without a run: ``model`` is ``model.name``."""
+        """The dotted name of an override: ``model`` becomes ``model.name``."""
         name = f"{key.replace('/', '.')}.name"
         return name if name in known else key
 
@@ -127,7 +127,7 @@ def _name(path: Path, folder: Path) -> str:
 
 
 def _groups(folder: Path) -> Iterator[tuple[Path, list[Path]]]:
-    """Folders that hold runs or are a sweep, each with the runs right in it."""
+    """Folders that contain runs or are a sweep, each with the runs directly in it."""
     if _is_job(folder):
         yield folder, [folder]
         return
@@ -145,7 +145,7 @@ def _is_job(folder: Path) -> bool:
 
 
 def read_run(run: Path, name: str) -> RunRow:
-    """One run directory as a row."""
+    """Read one run directory."""
     problems: list[str] = []
     has_config = (run / "config.yaml").exists()
     config = _mapping(run / ("config.yaml" if has_config else ".hydra/config.yaml"), problems)
@@ -168,7 +168,7 @@ def read_run(run: Path, name: str) -> RunRow:
     device = record.get("device")
     return RunRow(
         name=name,
-        # Jobs that never began still refer to other settings.
+        # Configurations of jobs that never began have unresolved interpolations.
         settings={key: value for key, value in settings.items() if "${" not in str(value)},
         overridden=frozenset(key_and_value(line)[0] for line in run_overrides(run)),
         scores=scores | _curve_scores(curve),
@@ -181,7 +181,7 @@ def read_run(run: Path, name: str) -> RunRow:
 
 
 def _mapping(path: Path, problems: list[str]) -> dict[str, Any] | None:
-    """A YAML or JSON file; None where there is none, or a problem noted where it is damaged."""
+    """A mapping from YAML or JSON; None if the file is missing, or damaged (noted in problems)."""
     try:
         text = path.read_text(encoding="utf-8")
         content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
@@ -241,12 +241,12 @@ def _scores(metrics: dict[str, Any]) -> dict[str, float]:
 
 
 def is_number(value: Any) -> bool:
-    """Whether a setting or score is a number, which true and false are not."""
+    """Whether a setting or score is a number; booleans are not."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def run_overrides(run: Path) -> list[str]:
-    """What the command line set, from Hydra's record of it or our own."""
+    """Overrides of the command line, from Hydra's record or overrides.txt."""
     with suppress(OSError, UnicodeDecodeError, yaml.YAMLError):
         content = yaml.safe_load((run / ".hydra" / "overrides.yaml").read_text(encoding="utf-8"))
         if isinstance(content, list):
@@ -264,7 +264,7 @@ def _value(text: str) -> Any:
 
 
 def _missing_jobs(sweep: Path, folder: Path, done: list[list[str]]) -> list[RunRow]:
-    """Rows for the jobs in multirun.yaml whose overrides belong to no run."""
+    """Rows for the jobs in multirun.yaml for which no run has the same overrides."""
     left = Counter(_settings_of(lines) for lines in done)
     rows = []
     for number, job in enumerate(_jobs(_mapping(sweep / "multirun.yaml", []) or {})):
@@ -279,7 +279,7 @@ def _missing_jobs(sweep: Path, folder: Path, done: list[list[str]]) -> list[RunR
 
 
 def _settings_of(overrides: Iterable[str]) -> tuple[str, ...]:
-    """Overrides in order, but for those that say how Hydra runs the job."""
+    """Sorted overrides, without those of ``resume`` and ``hydra``."""
     groups = {text: key_and_value(text)[0].split(".")[0] for text in overrides}
     return tuple(sorted(text for text in groups if groups[text] not in ("resume", "hydra")))
 
@@ -298,12 +298,12 @@ def _jobs(multirun: dict[str, Any]) -> list[list[str]]:
 
 
 def published_tables(folder: Path) -> list[str]:
-    """Published tables that the sweeps in a folder are shown with."""
+    """Names of published tables in the configurations of the sweeps in a folder."""
     found: list[str] = []
     for place, _ in _groups(folder):
         content = _mapping(place / "multirun.yaml", []) or {}
         with suppress(KeyError, TypeError):
-            # Sweeps of early 0.3 have it at the top.
+            # Early sweeps of version 0.3 have it at the top level.
             own = content.get("published") or content["hydra"]["callbacks"]["table"]["published"]
             found += [name for name in own if name not in found]
     return found

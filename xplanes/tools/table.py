@@ -40,11 +40,11 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
 
     Args:
         folder: A sweep, or any folder of runs.
-        out: Where table.md, table.csv, with several seeds table_seeds.csv, and with several runs
-            and the extra ``plots`` curves.png go; ``folder`` when None.
+        out: Output folder; ``folder`` when None. It gets table.md, table.csv, table_seeds.csv (if
+            there are several seeds), and with the extra ``plots`` curves.png and against.png.
 
     Returns:
-        What table.md holds.
+        Content of table.md.
 
     Raises:
         ConfigError: If there are no runs in the folder.
@@ -74,7 +74,7 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
 
 
 def _counts(rows: Sequence[RunRow]) -> str:
-    """Number of runs by how they ended, and the split of their scores."""
+    """Number of runs by status, and the split of their scores."""
     kinds = Counter(re.split("[:,;]", row.status)[0] for row in rows)
     tally = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
     splits = {row.split for row in rows if row.split}
@@ -91,11 +91,11 @@ PROTOCOL = {
     "trainer.max_steps": ("steps", ""),
     "trainer.max_seconds": ("seconds", "no limit"),
 }
-"""Settings that say how runs were made and scored, each with its name and what null means."""
+"""Settings of the protocol of training and scoring, each with its name and the word for null."""
 
 
 def _protocol(rows: Sequence[RunRow]) -> str:
-    """How the runs were made and scored, as far as it is known: size, budget, machine."""
+    """The protocol of training and scoring, as far as known: data, budget, machine."""
     known = [row.settings for row in rows if row.settings and not row.missing]
     parts = []
     for key, (name, unset) in PROTOCOL.items():
@@ -108,15 +108,14 @@ def _protocol(rows: Sequence[RunRow]) -> str:
 
 
 class SweepTable(Callback):
-    """Reports how each job of a multirun ended, and writes and prints the table at its end.
+    """Reports the result of each job of a multirun, and writes and prints the table at its end.
 
-    The table is written when the process ends: Hydra does not call ``on_multirun_end`` if a job
-    has failed or the sweep was stopped.
+    The table is also written at exit, since Hydra does not call ``on_multirun_end`` if a job has
+    failed or the sweep was stopped.
 
     Args:
-        published: Published tables to show with it, whatever the data.
-        sheet: What the contact sheet at the end shows, one of `xplanes.tools.sheet.WHAT`;
-            None for no sheet.
+        published: Published tables to add, whatever the data.
+        sheet: Kind of the contact sheet, one of `xplanes.tools.sheet.WHAT`; None for no sheet.
     """
 
     def __init__(self, published: Sequence[str] = (), sheet: str | None = None) -> None:
@@ -128,7 +127,7 @@ class SweepTable(Callback):
             check_published(self._published)
             check_what(self._sheet)
         except ConfigError as error:
-            sys.exit(f"error: {error}")  # Hydra makes warnings of other exceptions.
+            sys.exit(f"error: {error}")  # Hydra turns other exceptions into warnings.
         self._folder = Path(config.hydra.sweep.dir).absolute()
         atexit.register(self._finish)
 
@@ -150,7 +149,7 @@ class SweepTable(Callback):
         reason = f"{type(value).__name__}: {value}"
         _say(f"job {config.hydra.job.num} failed: {reason}  {run.name}")
         if not (run / "run.json").exists():
-            # It failed before it wrote its record.
+            # The job failed before it wrote run.json.
             write_json(run / "run.json", {"status": "failed", "reason": reason})
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
@@ -178,16 +177,16 @@ class SweepTable(Callback):
 
 
 def choose_gpu(job: int, environment: MutableMapping[str, str]) -> str | None:
-    """Give jobs that run side by side a GPU each: number of the job modulo number of GPUs.
+    """Choose a GPU for a parallel job: job number modulo number of GPUs.
 
-    A process keeps the GPU of its first job, because CUDA asks once which devices it may see.
+    A process keeps the GPU of its first job, because CUDA reads ``CUDA_VISIBLE_DEVICES`` only once.
 
     Args:
         job: Number of the job within the sweep.
-        environment: Its ``CUDA_VISIBLE_DEVICES`` is read, and set to the GPU chosen.
+        environment: Environment; its ``CUDA_VISIBLE_DEVICES`` is read, and set to the chosen GPU.
 
     Returns:
-        The GPU; None where there is no choice.
+        The GPU; None if there are fewer than two.
     """
     listed = environment.get("CUDA_VISIBLE_DEVICES")
     if listed is None:

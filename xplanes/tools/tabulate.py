@@ -1,4 +1,4 @@
-"""Rows of runs as tables: which columns they need, means over seeds, and markdown."""
+"""Tables of runs: choice of columns, means over seeds, and markdown."""
 
 import json
 import math
@@ -10,33 +10,33 @@ from xplanes.tools.sweep import SCORES, RunRow
 
 SEED = "seed"
 UNLISTED = ("resume", "callbacks.evaluation.at", "media", "trainer.log_every_n_steps")
-"""Settings that say nothing about a result."""
+"""Settings without influence on results."""
 
 SPREAD = ("psnr", "ssim", "psnr_foreground")
 """Scores whose standard deviation over seeds is shown."""
 
 LONGEST = 120
-"""Characters of a cell in markdown; the CSV has all of them."""
+"""Most characters of a cell in markdown; the CSV is not shortened."""
 
 Line = dict[str, Any]
 """A line of a table by column name: settings as text, scores as numbers."""
 
 
 def differing(rows: Sequence[RunRow]) -> list[str]:
-    """Settings in which runs differ, without those that a group or the model determines."""
+    """Settings in which runs differ, without those determined by the choice of a group or model."""
     known = [row for row in rows if row.settings]
     whole = [row for row in known if not row.missing]
     overridden = {name for row in rows for name in row.overridden}
     found = []
     for name in dict.fromkeys(name for row in known for name in row.settings):
-        # Jobs without a run know only what was overridden.
+        # For jobs without a run only the overrides are known.
         among = known if name in overridden or name.endswith(".name") else whole
         having = [row for row in among if name in row.settings or not row.missing]
         if len({_text(row.settings.get(name)) for row in having}) < 2 or _unlisted(name):
             continue
         parts = name.split(".")
         groups = [f"{'.'.join(parts[:end])}.name" for end in range(1, len(parts))]
-        # A model brings settings of other groups along.
+        # A model's configuration also sets values in other groups.
         follows = any(_follows(whole, name, group) for group in (*groups, "model.name"))
         if name in groups or name in overridden or not follows:
             found.append(name)
@@ -44,14 +44,14 @@ def differing(rows: Sequence[RunRow]) -> list[str]:
 
 
 def _follows(rows: Sequence[RunRow], name: str, group: str) -> bool:
-    """Whether the group's name determines the setting, among runs that have it."""
+    """Whether the group's option determines the setting, among runs that have it."""
     having = [row.settings for row in rows if name in row.settings]
     pairs = {(_text(settings.get(group)), _text(settings[name])) for settings in having}
     return len(pairs) == len({choice for choice, _ in pairs})
 
 
 def _unlisted(key: str) -> bool:
-    """Whether a setting says nothing about a result: where and what a run writes."""
+    """Whether a setting has no influence on results, such as output folders."""
     return key in UNLISTED or key.startswith("logger.") or key.endswith(".dirpath")
 
 
@@ -70,7 +70,7 @@ def run_table(rows: Sequence[RunRow], names: Sequence[str]) -> list[Line]:
 
 
 def _measures(rows: Iterable[RunRow]) -> list[str]:
-    """Scores of a table; that of the foreground object only if any run has it."""
+    """Scores of a table; ``psnr_foreground`` only if any run has it."""
     known = any("psnr_foreground" in row.scores for row in rows)
     return [name for name in SCORES if known or name != "psnr_foreground"]
 
@@ -80,9 +80,9 @@ def _settings(row: RunRow, names: Sequence[str]) -> Line:
 
 
 def seed_groups(rows: Sequence[RunRow]) -> list[list[RunRow]]:
-    """Finished runs that differ in nothing but their seed, if there are two such runs at all.
+    """Groups of finished runs that differ only in their seed; none if all groups have one run.
 
-    Of runs with the same settings and the same seed, which a repetition is, the first counts.
+    Of repeated runs with the same settings and seed, only the first counts.
     """
     groups: dict[str, dict[str, RunRow]] = {}
     for row in rows:
@@ -101,7 +101,7 @@ def seed_table(groups: Sequence[Sequence[RunRow]], names: Sequence[str]) -> list
         line = _settings(group[0], names) | {"seeds": len(group)}
         for name in _measures(row for group in groups for row in group):
             values = [row.scores[name] for row in group if name in row.scores]
-            # A mean over only the seeds that reached it would favour settings that rarely do.
+            # No mean if some seeds never reach the PSNR: it would be biased towards fast ones.
             line[name] = mean(values) if len(values) == len(group) else None
             if name in SPREAD:
                 line[f"{name}_std"] = stdev(values) if len(values) > 1 else None
@@ -130,7 +130,7 @@ def decomposition_table(rows: Sequence[RunRow], names: Sequence[str]) -> list[Li
 
 
 def mean_part(rows: Sequence[RunRow], name: str) -> float:
-    """Mean of a number in the decompositions of all runs and orientations; NaN without any."""
+    """Mean of a value over the decompositions of all runs and orientations; NaN if none has it."""
     values = [part.get(name) for row in rows for part in row.parts.values()]
     return mean([value for value in values if isinstance(value, int | float)])
 
@@ -141,7 +141,7 @@ def mean(values: Sequence[float]) -> float:
 
 
 def shown(lines: Sequence[Line]) -> str:
-    """A table in markdown, scores rounded and with their standard deviation, if they have one."""
+    """A table in markdown, with scores rounded and standard deviations added where known."""
     names = [name for name in lines[0] if not name.endswith("_std")]
     header = [SCORES[n].heading if n in SCORES else n.removesuffix(".name") for n in names]
     return markdown(header, [[_shown(line, name) for name in names] for line in lines])
@@ -155,7 +155,7 @@ def _shown(line: Line, name: str) -> str:
 
 
 def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A table in markdown, its columns aligned."""
+    """A table in markdown with aligned columns."""
     cells = [[_cell(text) for text in line] for line in (header, *lines)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     cells.insert(1, ["-" * width for width in widths])

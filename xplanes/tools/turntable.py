@@ -33,19 +33,19 @@ SAMPLES, CELLS = 192, 64
 def write_triplanes(
     paths: Sequence[Path], out: Path, experiment: Experiment, *, say: Callable[[str], None]
 ) -> Path:
-    """Encode images into triplanes; write these and a turntable video.
+    """Encode images into triplanes; write them and a turntable video.
 
     Args:
         paths: Images, or folders of them.
-        out: File to write, .safetensors or .pt; the video gets the same name and .webp.
-        experiment: Settings; the LRM's, the cache and the device are used.
+        out: File to write, .safetensors or .pt; the video has the same name with .webp.
+        experiment: Settings of the LRM, the cache and the device; others are ignored.
         say: Receives progress messages.
 
     Returns:
         The video file.
 
     Raises:
-        ConfigError, LRMError, SceneError: If a setting, the weights or a picture cannot be used.
+        ConfigError, LRMError, SceneError: If a setting, the weights or an image cannot be used.
     """
     pictures = find_pictures(paths)
     if out.suffix not in (".safetensors", ".pt"):
@@ -89,37 +89,37 @@ def write_triplanes(
 
 
 def find_pictures(paths: Sequence[Path]) -> list[Path]:
-    """Image files; a folder stands for all images in it, by the numbers in their names.
+    """Image files; of a folder all images, in natural order of their names.
 
     Raises:
-        SceneError: If one is missing, or there are none.
+        SceneError: If a path is missing, or there are no images.
     """
     found: list[Path] = []
     for path in paths:
         if path.is_dir():
             inside = sorted(filter(is_image, path.iterdir()), key=lambda p: natural(p.name))
             if not inside:
-                raise SceneError(f"{path} holds no pictures ({', '.join(ENDINGS)})")
+                raise SceneError(f"{path} contains no images ({', '.join(ENDINGS)})")
             found += inside
         elif path.is_file():
             found.append(path)
         else:
-            raise SceneError(f"{path}: there is no such picture or folder")
+            raise SceneError(f"{path}: there is no such image or folder")
     if not found:
-        raise SceneError("name at least one picture, or a folder of them")
+        raise SceneError("name at least one image, or a folder of images")
     return found
 
 
 def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[Tensor]:
-    """Frames of one camera orbit that begins at the model's canonical camera.
+    """Frames of a camera orbit that begins at the model's canonical camera.
 
     Args:
-        triplanes: One or more, shown one after another. [T, 3, C, H, H]
-        model: The model that produced them.
-        device: Where to render.
+        triplanes: One or more triplanes, shown one after another. [T, 3, C, H, H]
+        model: The LRM that produced them.
+        device: Device to render on.
 
     Yields:
-        Images on white. uint8 [SIDE, SIDE, 3]
+        Images with a white background. uint8 [SIDE, SIDE, 3]
     """
     view = model.view
     frame = cube_frame(view.half_side, torch.zeros(3))

@@ -1,4 +1,4 @@
-"""Interactive viewer in the browser, of a finished field or of one that is training."""
+"""Interactive viewer in the browser, for a trained field or one in training."""
 
 import contextlib
 import io
@@ -30,41 +30,41 @@ LOOP_SECONDS = 4.0
 """Duration of one playback from time 0 to 1, at speed 1."""
 TICK_SECONDS = 0.04
 SETTLE_SECONDS = 0.25
-"""Seconds that a camera must rest before the picture is drawn at full size."""
+"""Seconds without camera motion before the picture is rendered at full size."""
 MOVING_SECONDS = 0.08
-"""Seconds that a picture may take while the camera moves or time plays."""
+"""Rendering time of a picture, in seconds, while the camera moves or time plays."""
 FEWEST = 16
-"""Rows of a picture at least."""
+"""Least number of rows of a picture."""
 REFRESH_SECONDS, SHARE = 0.5, 3
-"""A still picture of a field in training is redrawn after this number of seconds, and not before
-this multiple of its own drawing time."""
+"""A picture of a field in training is refreshed after this number of seconds, but not before this
+multiple of its rendering time."""
 AWAY = 1.4
-"""The first camera's distance from the scene, as a share of the training cameras'."""
+"""Initial camera distance from the scene, relative to that of the training cameras."""
 FRUSTUM = 0.1
-"""Length of a camera's frustum, as a share of its distance from the scene."""
+"""Length of the cameras' frusta, relative to their median distance from the scene."""
 LARGEST_DEPTH = 160.0
-"""What viser takes for depth ends a little farther away."""
+"""Depth is clamped to this value, just below the largest that viser can encode."""
 GREY = (120, 120, 120)
 ABOUT_CAMERAS = "Training cameras, from dark to light in the order of their times."
 
 
 def camera_pose(wxyz: Tensor, position: Tensor) -> Tensor:
-    """Pose of a viser camera (x right, y down, looking along +z) in our axes. [4], [3] -> [4, 4]"""
+    """Camera-to-world matrix, OpenGL axes, of a viser camera (OpenCV axes). [4], [3] -> [4, 4]"""
     rotation = require("viser.transforms", extra="viewer").SO3(wxyz.numpy()).normalize()
     pose = torch.eye(4)
-    # The second and third column change sign: our y is up, and we look along -z.
+    # OpenCV to OpenGL axes: y and z change sign.
     pose[:3, :3] = torch.from_numpy(rotation.as_matrix()) * torch.tensor([1, -1, -1])
     pose[:3, 3] = position
     return pose
 
 
 def check_address(host: str, port: int, *, key: str) -> None:
-    """Refuse an address that cannot be served.
+    """Check that an address can be served.
 
     Args:
         host: Name or address of this machine.
         port: From 0 to 65535; 0 for any free one.
-        key: What messages call ``host`` and ``port``, which replace the braces.
+        key: Name of the settings in messages; ``host`` or ``port`` replaces the braces.
 
     Raises:
         ConfigError: If the port is taken or out of range, or the host is not this machine.
@@ -76,14 +76,14 @@ def check_address(host: str, port: int, *, key: str) -> None:
     try:
         family, kind, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind) as trial:
-            # Without it, a port that was served a moment ago would count as taken.
+            # Without this option, a port that was recently closed counts as taken.
             trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             trial.bind(address)
     except socket.gaierror as error:
         raise ConfigError(f"{key.format('host')}{host}: no such machine ({error})") from error
     except PermissionError as error:
         raise ConfigError(
-            f"{key.format('port')}{port}: it takes more rights than yours; choose one from 1024 on"
+            f"{key.format('port')}{port}: needs administrator rights; choose one from 1024 on"
         ) from error
     except OSError as error:
         raise ConfigError(
@@ -99,21 +99,21 @@ def _silence() -> contextlib.AbstractContextManager[Any]:
 class Viewer:
     """Serves one field; every browser has its own camera, the controls are shared.
 
-    Pictures are drawn by the thread that calls `catch_up`, never by the server's own: a field that
-    trains is drawn between its steps.
+    Pictures are rendered in the thread that calls `catch_up`, never in the server's threads, so a
+    field in training is rendered between steps.
 
     Args:
-        module: The field, built.
-        scene: Its scene.
-        renderer: Gives the renderer for the next picture.
+        module: The module with its field built.
+        scene: The scene.
+        renderer: Function that returns the renderer for the next picture.
         host: Address to listen on.
         port: Port to listen on; the next free one if it is taken.
-        trains: Whether the field trains, and can be paused.
+        trains: Whether the field is in training, which can then be paused.
 
     Attributes:
-        patience: Seconds that a picture at rest may take; larger ones become smaller.
-        step: Training step of the field; pictures are drawn again once it changes.
-        paused: Whether someone paused training.
+        patience: Longest rendering time of a picture at rest, in seconds; limits its size.
+        step: Training step of the field; pictures are rendered again when it changes.
+        paused: Whether training is paused.
 
     Raises:
         MissingExtraError: Without the extra ``viewer``.
@@ -138,7 +138,7 @@ class Viewer:
         self._browsers: dict[int, _Browser] = {}
         self._wake = threading.Event()
         self._ticked = time.monotonic()
-        # A browser may leave while its picture is drawn.
+        # A browser may disconnect while its picture is rendered.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
         with _silence():  # viser prints its own message.
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
@@ -152,7 +152,7 @@ class Viewer:
 
     @property
     def port(self) -> int:
-        """The port that is served."""
+        """The port of the server."""
         return self.server.get_port()
 
     @property
@@ -161,18 +161,18 @@ class Viewer:
         return bool(self._browsers)
 
     def run(self) -> None:
-        """Draw until interrupted."""
+        """Serve browsers until interrupted."""
         while True:
             self.catch_up()
             self.wait()
 
     def wait(self) -> None:
-        """Wait until a browser wants something, or for a moment."""
+        """Wait for a change in a browser, for at most `TICK_SECONDS`."""
         self._wake.wait(TICK_SECONDS)
         self._wake.clear()
 
     def catch_up(self, seconds: float = math.inf) -> None:
-        """Draw what browsers wait for; no further picture is begun after a number of seconds."""
+        """Render all pictures that are due; no new one is begun after ``seconds``."""
         end = time.monotonic() + seconds
         while True:
             self._play()
@@ -196,24 +196,24 @@ class Viewer:
             self.server.stop()
 
     def shot(self, camera: Any, height: int) -> Shot:
-        """What a viser camera sees now, in a given number of rows."""
+        """The picture to render for a viser camera, with the current controls."""
         pose = camera_pose(torch.from_numpy(camera.wxyz), torch.from_numpy(camera.position))
         view = float(self.time.value), camera.fov, height, camera.aspect
         return Shot(pose, *view, mode=self.mode.value, box=self.box)
 
     @property
     def box(self) -> Tensor | None:
-        """Least and largest corner of what is shown; None where that is the whole cube. [2, 3]"""
+        """Least and largest corner of the crop; None for the whole cube. [2, 3]"""
         ends = torch.tensor([slider.value for slider in self.crop], dtype=torch.float32).T
         return None if bool((ends.abs() == 1).all()) else ends
 
     @property
     def needs_depth(self) -> bool:
-        """Whether lines are drawn, which the scene may hide."""
+        """Whether lines are shown, which the scene may occlude."""
         return bool(self.cameras.value or self.outline.visible)
 
     def _place_camera(self) -> None:
-        """Put browsers beside the training camera nearest to where videos begin."""
+        """Place the initial camera behind the training camera nearest to the start of the orbit."""
         cameras = self.views.camera_to_world[:, :3, 3]
         begin = orbit_poses(self.views, self.frame, 1)[0, :3, 3]
         nearest = cameras[(cameras - begin).norm(dim=-1).argmin()]
@@ -234,7 +234,7 @@ class Viewer:
             self.play = gui.add_button("Play", disabled=static)
             self.speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1")
         with gui.add_folder("Picture"):
-            # Where no pixel is transparent, the images rule nothing out.
+            # Opaque images have no silhouettes, so they cannot reveal floaters.
             modes = [mode for mode in MODES if mode != "floaters" or not self.views.is_opaque]
             self.mode = gui.add_dropdown("show", tuple(modes))
             size = min(SIZES, key=lambda text: abs(int(text) - self.views.height))
@@ -279,7 +279,7 @@ class Viewer:
         self._wake.set()
 
     def _play(self) -> None:
-        """Let time pass, where it plays."""
+        """Advance the time slider while it plays."""
         now = time.monotonic()
         passed, self._ticked = now - self._ticked, now
         if self.playing:
@@ -317,19 +317,19 @@ class Viewer:
 
 @dataclass
 class _Browser:
-    """What one browser was sent, and what it waits for.
+    """State of one connected browser.
 
     Attributes:
-        viewer: Serves it.
-        client: Viser's handle of it.
-        version: Counts changes of what it should show.
-        changed: When the last of them was.
-        drawn: ``version`` of its picture.
-        step: Training step of its picture.
-        sharp: Whether its picture is as large as it can be.
-        began: When its picture was begun.
-        again: When its picture is to be drawn again, if the field has changed.
-        rate: Pixels that are drawn in a second.
+        viewer: The viewer.
+        client: Viser's handle of the browser.
+        version: Number of changes of its camera and the controls.
+        changed: Time of the last change.
+        drawn: ``version`` of its last picture.
+        step: Training step of its last picture.
+        sharp: Whether its last picture has the full size.
+        began: Time at which rendering of its last picture began.
+        again: Earliest time of the next picture, if only the field has changed.
+        rate: Rendering speed in pixels per second.
     """
 
     viewer: Viewer
@@ -344,7 +344,7 @@ class _Browser:
     rate: float = 1e4
 
     def change(self) -> None:
-        """Something has changed; called by the server's threads."""
+        """Record a change; called by the server's threads."""
         self.changed = time.monotonic()
         self.version += 1
         self.viewer._wake.set()
@@ -359,13 +359,13 @@ class _Browser:
         return 0
 
     def _affordable(self, seconds: float) -> int:
-        """Rows of a picture that can be drawn in a given time."""
+        """Rows of a picture that can be rendered in a given time."""
         full = int(self.viewer.size.value)
         pixels = min(self.rate * seconds / max(self.client.camera.aspect, 0.1), full * full)
         return max(FEWEST, min(full, int(math.sqrt(pixels))))
 
     def draw(self, height: int, now: float) -> None:
-        """Draw and send a picture; one at rest is given up once something changes."""
+        """Render and send a picture; one at rest is abandoned on a change."""
         viewer, version = self.viewer, self.version
         resting = version == self.drawn
         field, shot = viewer.module.field, viewer.shot(self.client.camera, height)

@@ -42,7 +42,7 @@ class Camera:
         if shape != [4, 4]:
             raise ValueError(f"camera.world_to_camera is {shape}, but must be [4, 4]")
         if not self.world_to_camera.isfinite().all():
-            raise ValueError("camera.world_to_camera is not finite: look at the poses of the views")
+            raise ValueError("camera.world_to_camera is not finite: check the poses of the views")
         for name in ("fx", "fy", "width", "height", "near"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise ValueError(f"camera.{name}={getattr(self, name)}: must be positive")

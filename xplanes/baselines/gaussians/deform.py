@@ -55,7 +55,7 @@ class DeformedGaussiansSettings(GaussiansSettings):
 
 
 class DeformedGaussiansModel(GaussiansModel):
-    """Errors of colours and adaptive density control.
+    """Colour errors and adaptive density control.
 
     Args:
         settings: Learning rates, schedule and weights.
@@ -80,7 +80,7 @@ class DeformedGaussiansModel(GaussiansModel):
         return groups
 
     def rate_of(self, group: str, step: int, progress: float) -> float:
-        """Exponential decay of means and network."""
+        """Exponential decay of the learning rates of means and network."""
         if group == "network":
             return self.settings.final_network_lr**progress
         return super().rate_of(group, step, min(1.0, progress / MEANS_UNTIL))

@@ -1,4 +1,4 @@
-"""Adaptive density control: Gaussians are cloned, split and removed as training goes on."""
+"""Adaptive density control: Gaussians are cloned, split and removed during training."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ from xplanes.baselines.gaussians.reference import rotations
 from xplanes.settings import Count, Positive, Settings, Share, Steps
 
 SHRINK = 1.6
-"""Factor by which halves are smaller than the Gaussian that was split (Kerbl et al. 2023)."""
+"""Factor by which a split reduces the scales of a Gaussian (Kerbl et al. 2023)."""
 
 LARGEST = 0.1
 """Gaussians above this share of the cameras' extent are removed after a reset (Kerbl et al.)."""
 
 RESET_OPACITY = 0.01
-"""Opacity at most, after a reset (Kerbl et al. 2023)."""
+"""Largest opacity after a reset (Kerbl et al. 2023)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,29 +45,28 @@ def densify(
     remove_large: bool,
     views: int = 1,
 ) -> None:
-    """Double Gaussians whose projected means have large gradients, and remove faint ones.
+    """Clone or split Gaussians whose projected means have large gradients, and remove faint ones.
 
-    Small Gaussians are cloned where they are. Large ones are replaced by two smaller ones, drawn
-    from themselves. Moments of the optimiser follow their rows; those of new rows are 0.
+    Small Gaussians are cloned in place. Large ones are replaced by two smaller ones, whose means
+    are drawn from them. Moments of the optimiser are kept with their rows; new rows get 0.
 
     Args:
-        field: Changed in place, its statistics set to 0.
-        optimizer: Of its parameters; changed in place.
+        field: The Gaussians; changed in place, with statistics reset.
+        optimizer: The optimiser of their parameters; changed in place.
         settings: Thresholds.
-        generator: Draws the places of halves.
-        remove_large: Whether Gaussians larger than `LARGEST` are removed, too, once halves are
-            smaller.
-        views: Views whose losses a step averages: the statistics hold that share of each gradient.
+        generator: Draws the means of split Gaussians.
+        remove_large: Whether Gaussians larger than `LARGEST`, after splitting, are also removed.
+        views: Views per step: losses are means over them, so gradients are scaled back by it.
 
     Raises:
-        GaussianError: If none would be left.
+        GaussianError: If no Gaussian would be left.
     """
     slopes = views * field.slopes / field.seen.clamp(min=1)
     size, extent = field.scales.amax(dim=1), float(field.extent)
     keep = field.opacities >= settings.least_opacity
     steep, large = slopes >= settings.threshold, size > settings.large * extent
     if remove_large:
-        # A split comes before: halves that are small enough stay.
+        # Sizes after splitting count.
         keep &= torch.where(steep & large, size / SHRINK, size) <= LARGEST * extent
     if not keep.any():
         raise GaussianError(
@@ -101,13 +100,13 @@ def densify(
 def select_rows(
     field: Gaussians, optimizer: torch.optim.Optimizer, source: Tensor, fresh: Tensor
 ) -> None:
-    """Give a field other rows of its own, with their moments in the optimiser.
+    """Replace the rows of a field by copies of some of them, with their moments in the optimiser.
 
     Args:
-        field: Changed in place; no gradients may wait.
+        field: Changed in place; there must be no pending gradients.
         optimizer: Changed in place.
-        source: Row of before that each row of afterwards is a copy of. int64 [M]
-        fresh: Rows whose moments begin at 0. bool [M]
+        source: Index of the old row that each new row copies. int64 [M]
+        fresh: New rows whose moments are set to 0. bool [M]
     """
     for tensor in field.rows.values():
         for name, moments in optimizer.state.get(tensor, {}).items():
@@ -120,7 +119,7 @@ def select_rows(
 
 @torch.no_grad()
 def reset_opacity(field: Gaussians, optimizer: torch.optim.Optimizer) -> None:
-    """Lower all opacities to `RESET_OPACITY` at most, with moments of 0."""
+    """Clamp all opacities to `RESET_OPACITY`, and set their moments to 0."""
     most = torch.tensor(RESET_OPACITY).logit()
     field.logits.data.clamp_(max=float(most))
     for name, moments in optimizer.state.get(field.logits, {}).items():

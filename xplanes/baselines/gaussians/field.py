@@ -1,4 +1,4 @@
-"""Gaussians as a representation: their parameters, and how planes, a network or they move them."""
+"""Dynamic Gaussians: parameters, and motion by planes, by a network or by polynomials."""
 
 import math
 from abc import abstractmethod
@@ -20,34 +20,34 @@ BASE = 0.28209479177387814
 """The spherical harmonic of degree 0."""
 
 NEIGHBOURS = 3
-"""Whose mean squared distance is the first variance of a Gaussian (Kerbl et al. 2023)."""
+"""Neighbours whose mean squared distance is a Gaussian's initial variance (Kerbl et al. 2023)."""
 
 FIRST_OPACITY = 0.1
-"""Of every Gaussian, where nothing is known of surfaces (Kerbl et al. 2023)."""
+"""Initial opacity of Gaussians without known surfaces (Kerbl et al. 2023)."""
 
 ROWS = 1024
-"""Points whose distances to all others are in memory at once."""
+"""Points per block in the search for neighbours."""
 
 TIME_FEATURES = 30
-"""What the network of time makes of it (Yang et al. 2024)."""
+"""Number of time features (Yang et al. 2024)."""
 
 HEADS = {"shift": 3, "turn": 4, "growth": 3}
-"""What is added to means, quaternions and scales, and its columns."""
+"""Columns of the offsets of means, quaternions and scales."""
 
 ORDER = 3
-"""Of the polynomials of means in time (Li et al. 2024)."""
+"""Degree of the polynomials of means in time (Li et al. 2024)."""
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """What Gaussians are made from.
+    """Points from which Gaussians are initialised.
 
     Attributes:
-        points: Places in the field's frame. [N, 3]
+        points: Positions in the field's frame. [N, 3]
         colours: From 0 to 1. [N, 3]
-        times: When each was seen there, from 0 to 1; None where that is not known. [N]
-        scales: Standard deviations; None for the distances to neighbours. [N]
-        opacity: Of all of them, from 0 to 1.
+        times: Time at which each point was observed, from 0 to 1; None if unknown. [N]
+        scales: Standard deviations; None for `neighbour_distance`. [N]
+        opacity: Initial opacity, from 0 to 1.
     """
 
     points: Tensor
@@ -59,16 +59,15 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class PosedGaussians:
-    """Gaussians at one time, as a rasteriser takes them.
+    """Gaussians at one time, ready for the rasteriser.
 
     Attributes:
         means: In the field's frame. [N, 3]
         quaternions: Rotations (w, x, y, z) of any length. [N, 4]
         scales: Standard deviations along the rotated axes. [N, 3]
         opacities: From 0 to 1. [N]
-        harmonics: Coefficients of the colours' spherical harmonics, of which 0.5 is left out.
-            [N, K, 3]
-        degree: Highest degree that is in use.
+        harmonics: Coefficients of the spherical harmonics of colours minus 0.5. [N, K, 3]
+        degree: Highest degree in use.
     """
 
     means: Tensor
@@ -82,14 +81,14 @@ class PosedGaussians:
 class Gaussians(Representation):
     """Canonical Gaussians, whose number changes in training, and their motion.
 
-    Tensors with a row for each Gaussian are those that `rows` names. A state of another number of
-    Gaussians can be loaded.
+    `rows` lists the tensors with one row per Gaussian. A state with another number of Gaussians can
+    be loaded.
 
     Args:
-        cloud: First means and colours.
+        cloud: Initial means and colours.
         degree: Highest degree of the spherical harmonics.
-        extent: How far apart the cameras stand, in units of the field's frame.
-        moves: Whether there is any motion.
+        extent: Extent of the cameras, see `camera_extent`, in units of the field's frame.
+        moves: Whether the scene is dynamic.
 
     Source: Kerbl et al. 2023, released code.
     """
@@ -110,7 +109,7 @@ class Gaussians(Representation):
         self.base = nn.Parameter((cloud.colours - 0.5)[:, None] / BASE)  # [N, 1, 3]
         self.detail = nn.Parameter(torch.zeros(count, (degree + 1) ** 2 - 1, 3))
         self._moves = moves
-        # Sum of the projected means' gradients, and how often each Gaussian was drawn.
+        # Sum of gradient norms of the projected means, and number of views with each Gaussian.
         self.register_buffer("slopes", torch.zeros(count))
         self.register_buffer("seen", torch.zeros(count))
         self.register_buffer("degree", torch.tensor(0))
@@ -155,7 +154,7 @@ class Gaussians(Representation):
 
     @property
     def rows(self) -> dict[str, Tensor]:
-        """The tensors with a row for each Gaussian."""
+        """The tensors with one row per Gaussian."""
         return {name: getattr(self, name) for name in (*self.PARAMETERS, *self.STATISTICS)}
 
     @property
@@ -165,12 +164,12 @@ class Gaussians(Representation):
 
     @property
     def opacities(self) -> Tensor:
-        """From 0 to 1. [N]"""
+        """Canonical opacities, from 0 to 1. [N]"""
         return self.logits.sigmoid()
 
     @abstractmethod
     def moved(self, canonical: PosedGaussians, time: float) -> PosedGaussians:
-        """What moves, at a time from 0 to 1.
+        """The Gaussians after their motion to a time.
 
         Args:
             canonical: The canonical Gaussians.
@@ -190,7 +189,7 @@ class Gaussians(Representation):
         return self.moved(canonical, time) if self.moves and self.deforms else canonical
 
     def training_time(self, time: float, state: TrainingState) -> float:
-        """The time at which a view of some time is drawn in training."""
+        """The time at which a view is rendered in training; subclasses may add noise."""
         return time
 
     def _load_from_state_dict(
@@ -214,24 +213,24 @@ class Gaussians(Representation):
 
 
 class MaskedGaussians(Masked):
-    """Gaussians without those whose means lie in some places."""
+    """Gaussians without those whose means are in some regions."""
 
     def at(self, time: float) -> PosedGaussians:
-        """As `Gaussians.at`."""
+        """See `Gaussians.at`."""
         posed = self._field.at(time)
         return replace(posed, opacities=posed.opacities * self._keep(posed.means))
 
 
 class HexPlaneGaussians(Gaussians):
-    """Gaussians that a multi-resolution field of six planes moves, turns and scales.
+    """Gaussians that a multi-resolution field of six planes moves, rotates and scales.
 
-    Gradients of the deformation reach planes and networks, and the means only as what is added to.
+    The deformation reads detached means: its gradients reach only planes and networks.
 
     Args:
-        cloud: As `Gaussians`.
-        degree: As `Gaussians`.
-        extent: As `Gaussians`.
-        planes: The field's planes; None where nothing moves.
+        cloud: See `Gaussians`.
+        degree: See `Gaussians`.
+        extent: See `Gaussians`.
+        planes: The planes; None for a static scene.
         width: Neurons of the hidden layers.
 
     Source: 4D-GS (Wu et al. 2024), Section 4.
@@ -278,20 +277,20 @@ class HexPlaneGaussians(Gaussians):
 
 
 class DeformedGaussians(Gaussians):
-    """Gaussians that a network of place and time moves, turns and scales.
+    """Gaussians that a network of position and time moves, rotates and scales.
 
-    Gradients of the deformation reach the network, and the means only as what is added to.
+    The network reads detached means: its gradients reach only its weights.
 
     Args:
-        cloud: As `Gaussians`.
-        degree: As `Gaussians`.
-        extent: As `Gaussians`.
-        moves: As `Gaussians`.
-        depth: Hidden layers; the encoded input enters once more after the middle one.
+        cloud: See `Gaussians`.
+        degree: See `Gaussians`.
+        extent: See `Gaussians`.
+        moves: See `Gaussians`.
+        depth: Number of hidden layers; the encoded input is concatenated after the middle one.
         width: Neurons of the hidden layers.
-        octaves: Frequencies of the encodings of places and times.
-        noise: Standard deviation of the noise on time, at the beginning of training.
-        noise_until: Share of training over which it fades to 0.
+        octaves: Frequencies of the encodings of positions and times.
+        noise: Initial standard deviation of the noise on time.
+        noise_until: Share of training over which the noise fades to 0.
 
     Source: Deformable 3D Gaussians (Yang et al. 2024), Section 3, and its released code.
     """
@@ -341,12 +340,12 @@ class DeformedGaussians(Gaussians):
             canonical,
             means=canonical.means + shift,
             quaternions=F.normalize(canonical.quaternions, dim=1) + turn,
-            # A covariance knows no signs.
+            # The covariance does not depend on the sign.
             scales=(canonical.scales + growth).abs(),
         )
 
     def training_time(self, time: float, state: TrainingState) -> float:
-        """The time and noise that fades, so that motion is smooth in time (the paper's Eq. 6)."""
+        """The time with fading noise, for smooth motion (Yang et al. 2024, Eq. 6)."""
         left = 1 - state.progress / self.noise_until if self.noise_until else 0.0
         if not (self.noise and left > 0 and self.deforms):
             return time
@@ -355,20 +354,20 @@ class DeformedGaussians(Gaussians):
 
 
 class SpacetimeGaussians(Gaussians):
-    """Gaussians that come and go, and move along polynomials in time.
+    """Gaussians whose opacity varies with time, and which move along polynomials in time.
 
-    Opacity is a radial basis in time around each Gaussian's own centre; means are polynomials of
-    degree 3 and quaternions of degree 1 in the time since that centre.
+    Opacity is a radial basis function of time with a learned centre per Gaussian; means are
+    polynomials of degree 3, and quaternions of degree 1, in the time since this centre.
 
     Args:
-        cloud: As `Gaussians`; its times are the centres, which are random where it has none.
-        degree: As `Gaussians`.
-        extent: As `Gaussians`.
-        moves: As `Gaussians`.
-        width: First width of the radial basis, where 1 is the whole time.
+        cloud: See `Gaussians`; its times are the initial centres, which are random without times.
+        degree: See `Gaussians`.
+        extent: See `Gaussians`.
+        moves: See `Gaussians`.
+        width: Initial width of the radial basis; the whole sequence has length 1.
 
     Source: Spacetime Gaussians (Li et al. 2024), Section 4.1, in its lite version: without the
-    network behind the rasteriser.
+    network after the rasteriser.
     """
 
     PARAMETERS = (*Gaussians.PARAMETERS, "centres", "log_widths", "motion", "spin")
@@ -392,7 +391,7 @@ class SpacetimeGaussians(Gaussians):
     def moved(self, canonical: PosedGaussians, time: float) -> PosedGaussians:
         since = time - self.centres
         life = (-(since / self.log_widths.exp()).square()).exp()
-        # As released: motion says nothing about when a Gaussian is there.
+        # As in the released code, gradients of the motion do not reach the centres.
         since = since.detach()[:, None]
         powers = torch.cat([since**power for power in range(1, ORDER + 1)], dim=1)
         return replace(
@@ -404,7 +403,7 @@ class SpacetimeGaussians(Gaussians):
 
 
 def _still(inputs: int, outputs: int) -> nn.Linear:
-    """A last layer of zeros: what moves begins where it lies."""
+    """A last layer initialised to zero: the initial deformation is the identity."""
     layer = nn.Linear(inputs, outputs)
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)
@@ -423,7 +422,7 @@ def neighbour_distance(points: Tensor) -> Tensor:
         return torch.full_like(points[:, 0], 0.1)
     count = min(NEIGHBOURS, len(points) - 1)
     found = [
-        # The nearest is the point itself.
+        # The nearest point is the point itself.
         torch.cdist(part, points).topk(count + 1, largest=False).values[:, 1:]
         for part in points.split(ROWS)
     ]

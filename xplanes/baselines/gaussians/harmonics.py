@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 MAX_DEGREE = 3
-"""Of Kerbl et al. 2023: 16 coefficients a channel."""
+"""Highest degree, as in Kerbl et al. 2023: 16 coefficients per channel."""
 
 
 def spherical_harmonics(degree: int, coefficients: Tensor, directions: Tensor) -> Tensor:

@@ -73,7 +73,7 @@ class HexPlaneGaussiansSettings(GaussiansSettings):
 
 
 class HexPlaneGaussiansModel(GaussiansModel):
-    """Errors of colours, smooth planes, and adaptive density control.
+    """Colour errors, smoothness of planes, and adaptive density control.
 
     Args:
         settings: Learning rates, schedule and weights.
@@ -100,7 +100,7 @@ class HexPlaneGaussiansModel(GaussiansModel):
         return groups
 
     def rate_of(self, group: str, step: int, progress: float) -> float:
-        """Exponential decay of means, planes and network, from the start in each stage."""
+        """Exponential decay for means, planes and network, restarted in the dynamic stage."""
         if group not in ("means", "planes", "network"):
             return 1.0
         static = self.static_share if self._field.moves else 0.0
@@ -108,7 +108,7 @@ class HexPlaneGaussiansModel(GaussiansModel):
         return self.settings.final_lr ** ((progress - begun) / max(1 - static, 1e-6))
 
     def begin_to_move(self, optimizer: torch.optim.Optimizer) -> None:
-        """Forget the static stage's moments and statistics, as released."""
+        """Reset the optimiser's moments and the statistics, as in the released code."""
         optimizer.state.clear()
         self._field.slopes.zero_()
         self._field.seen.zero_()

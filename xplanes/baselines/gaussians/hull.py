@@ -1,4 +1,4 @@
-"""First points of Gaussians: on the visual hull of the training views, or anywhere in the cube."""
+"""Initial points of Gaussians: on the visual hull of the training views, or random in the cube."""
 
 import torch
 import torch.nn.functional as F
@@ -11,34 +11,34 @@ from xplanes.scenes.silhouettes import may_hold
 from xplanes.scenes.views import Views
 
 CELLS = 48
-"""Cells along each side of the cube in which the hull is looked for."""
+"""Cells along each side of the cube for the visual hull."""
 
 AGREEMENT = 0.95
-"""Share of the views, of that in the fullest cell, whose silhouettes must hold a cell."""
+"""Share of views with a cell in their silhouette, relative to the best cell, for a solid cell."""
 
 VIEWS = 64
-"""Views that are asked at most, spread evenly."""
+"""Most views that are used, evenly spaced."""
 
 CHUNK = 2**15
-"""Cells that are looked at together."""
+"""Cells per block."""
 
 
 def random_points(count: int) -> PointCloud:
-    """Grey points anywhere in the cube [-1, 1]^3, with torch's generator."""
+    """Grey points, uniform in the cube [-1, 1]^3, drawn with torch's global generator."""
     return PointCloud(2 * torch.rand(count, 3) - 1, torch.full((count, 3), 0.5))
 
 
 def hull_points(views: Views, frame: Frame, count: int) -> PointCloud:
-    """Points on the surface of what the silhouettes of all times have in common.
+    """Random points on the surface of the visual hull of all times.
 
     Args:
-        views: Training views. Without alpha the points are random.
+        views: Training views. Without alpha the points are random in the cube.
         frame: The field's frame.
-        count: Number of points; places are drawn with torch's generator. They lie where half of the
-            views look at least.
+        count: Number of points, drawn with torch's global generator in cells that at least half of
+            the views see.
 
     Returns:
-        The points; colours are the mean over views of the pixels that show them, hidden or not.
+        The points; colours are means over the views of their pixels, without regard to occlusion.
     """
     if views.is_opaque:
         return random_points(count)
@@ -49,7 +49,7 @@ def hull_points(views: Views, frame: Frame, count: int) -> PointCloud:
     world, radius = frame.to_world(centres), 0.5 / CELLS / frame.scale
     share = torch.cat([_agreement(views, part, radius) for part in world.split(CHUNK)])
     solid = (share >= AGREEMENT * share.max()).view(1, 1, CELLS, CELLS, CELLS)
-    # A cell lies inside if all 26 around it do; beyond the cube there is nothing.
+    # A cell is inside if its 26 neighbours are solid; cells outside of the cube are empty.
     around = F.max_pool3d(F.pad((~solid).float(), [1] * 6, value=1.0), 3, stride=1) > 0
     surface = (solid & around).flatten().nonzero()[:, 0]
     cells = surface[torch.randint(len(surface), (count,))]
@@ -58,7 +58,7 @@ def hull_points(views: Views, frame: Frame, count: int) -> PointCloud:
 
 
 def _agreement(views: Views, points: Tensor, radius: float) -> Tensor:
-    """Share of the views that see world points whose silhouettes hold them; 0 if few do. [N]"""
+    """Share of views, among those that see a point, with it in their silhouette; 0 if few. [N]"""
     held = may_hold(views, points, radius=radius)
     seen = torch.stack([_pixels(views, index, points)[2] for index in range(len(views))])
     count = seen.sum(dim=0)
@@ -66,7 +66,7 @@ def _agreement(views: Views, points: Tensor, radius: float) -> Tensor:
 
 
 def _pixels(views: Views, index: int, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows and columns of a view's pixels that show world points, and which are in it. [N] each"""
+    """Rows and columns of world points in a view, and whether they are in the image. [N] each"""
     (height, width), intrinsics = views.size(index), views.intrinsics
     column, row, seen = project(
         views.camera_to_world[index],
@@ -80,7 +80,7 @@ def _pixels(views: Views, index: int, points: Tensor) -> tuple[Tensor, Tensor, T
 
 
 def _mean_colours(views: Views, points: Tensor) -> Tensor:
-    """Mean colour of the pixels with alpha that show world points; grey where none does. [N, 3]"""
+    """Mean colour of world points' pixels, weighted by alpha; grey if there are none. [N, 3]"""
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
     for index in range(len(views)):
         row, column, seen = _pixels(views, index, points)

@@ -1,4 +1,4 @@
-"""What all models of Gaussians share: first points, learning rates, loss, density control."""
+"""Base of all models of Gaussians: initial points, learning rates, loss, density control."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,12 +20,12 @@ from xplanes.settings import Count, Positive, Settings, Share, Steps
 from xplanes.streams import Stream, TrainingState
 
 EXTENT = 1.1
-"""Factor on the largest distance of a camera from their mean (Kerbl et al. 2023)."""
+"""Factor on the largest distance of a camera from the cameras' mean (Kerbl et al. 2023)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class InitialPoints(InitialValues):
-    """Points that Gaussians are made from."""
+    """Points from which Gaussians are initialised."""
 
     planes: Mapping[str, Tensor] = field(default_factory=dict)
     cloud: PointCloud
@@ -74,18 +74,18 @@ class GaussiansSettings(ModelSettings):
             )
 
     def first_points(self, site: Site, initial: InitialValues | None) -> PointCloud:
-        """What the Gaussians are made from; places are drawn with torch's generator."""
+        """Points from which the Gaussians are initialised, drawn with torch's global generator."""
         if isinstance(initial, InitialPoints):
             return initial.cloud
         if site.views is None:
-            return random_points(1)  # A checkpoint brings its own.
+            return random_points(1)  # The Gaussians are loaded from a checkpoint.
         if self.points == "silhouettes":
             return hull_points(site.views, site.frame, self.count)
         return random_points(self.count)
 
 
 class GaussiansModel(Model):
-    """Absolute and structural errors of colours, and adaptive density control.
+    """Absolute colour error and dissimilarity (1 - SSIM), and adaptive density control.
 
     Args:
         settings: Learning rates, schedule and weights.
@@ -146,13 +146,13 @@ class GaussiansModel(Model):
             reset_opacity(field, optimizer)
 
     def begin_to_move(self, optimizer: torch.optim.Optimizer) -> None:
-        """Do what is due when the static stage ends."""
+        """Called at the end of the static stage."""
         return
 
     def losses(self, rendering: Any, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         share, target = self._settings.loss.dissimilarity, rays["target"]
         colour = rendering.colour
-        if (shown := rays.get("shown")) is not None:  # Others count as right.
+        if (shown := rays.get("shown")) is not None:  # Ignored pixels have no error.
             colour = torch.where(shown[:, None], colour, target)
         terms = {"colour": (1 - share) * (colour - target).abs().mean()}
         if share:
@@ -165,9 +165,9 @@ class GaussiansModel(Model):
 
 
 def camera_extent(site: Site) -> float:
-    """How far the cameras stand from their mean at most, 1.1 times, in units of the frame.
+    """Extent of the cameras: 1.1 times their largest distance from their mean, in frame units.
 
-    At least 1, half the cube: cameras may all stand in one place.
+    It is at least 1, half the side of the cube, since all cameras may have the same position.
     """
     if site.views is None:
         return 1.0

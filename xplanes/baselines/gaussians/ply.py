@@ -1,4 +1,4 @@
-"""Gaussians at one time as a PLY file, as viewers of 3D Gaussian splatting read it."""
+"""Writes Gaussians at one time as a PLY file in the format of 3D Gaussian splatting."""
 
 import math
 from pathlib import Path
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 @torch.no_grad()
 def write_gaussians(path: Path, posed: "PosedGaussians", frame: Frame) -> Path:
-    """Write Gaussians, in the world, as 3DGS and its viewers lay out a PLY.
+    """Write Gaussians in world coordinates as a PLY file for 3DGS and its viewers.
 
-    Opacities are written before the sigmoid, scales as logarithms, colours as coefficients of
-    spherical harmonics, those of degree 1 and higher channel by channel.
+    Opacities are written as logits, scales as logarithms, colours as coefficients of spherical
+    harmonics, those of degree 1 and higher channel by channel.
 
     Args:
         path: The file without its suffix.
@@ -31,14 +31,14 @@ def write_gaussians(path: Path, posed: "PosedGaussians", frame: Frame) -> Path:
         The file.
 
     Raises:
-        ConfigError: If the frame is turned against the world.
+        ConfigError: If the frame is rotated against the world.
 
     Source: Kerbl et al. 2023, released code.
     """
     if not torch.equal(frame.rotation, torch.eye(3)):
         raise ConfigError(
-            "--what gaussians: the field's frame is turned against the world; train without a "
-            "frame of your own"
+            "--what gaussians: the field's frame is rotated against the world; train without a "
+            "custom frame"
         )
     means, harmonics = frame.to_world(posed.means.cpu()), posed.harmonics
     columns = {
@@ -48,7 +48,7 @@ def write_gaussians(path: Path, posed: "PosedGaussians", frame: Frame) -> Path:
         " ".join(f"f_rest_{n}" for n in range(3 * (harmonics.shape[1] - 1))): harmonics[:, 1:]
         .transpose(1, 2)
         .flatten(1),
-        # Of opacities of 0 and 1 it would be infinite.
+        # The logits of 0 and 1 would be infinite.
         "opacity": posed.opacities.logit(eps=1e-6)[:, None],
         "scale_0 scale_1 scale_2": posed.scales.log() - math.log(frame.scale),
         "rot_0 rot_1 rot_2 rot_3": F.normalize(posed.quaternions, dim=1),

@@ -1,4 +1,4 @@
-"""First points of Gaussians, from an X-Planes field that is trained for a few seconds."""
+"""Initial points of Gaussians, from a briefly trained X-Planes field."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -30,19 +30,19 @@ from xplanes.streams import Stream, step_generator
 from xplanes.training.module import RadianceModule
 
 RAYS = 8192
-"""Rays that are drawn together."""
+"""Rays per round."""
 
 ROUNDS = 40
-"""Times that rays are drawn, at most."""
+"""Most rounds of rays."""
 
 OPAQUE = 0.5
-"""Least opacity of a ray at which there is a surface, and first opacity of the Gaussians on it."""
+"""Least opacity of rays with a surface, and initial opacity of the Gaussians on it."""
 
 CANDIDATES = 2
-"""Points that are looked for, of which one is kept: the denser half."""
+"""Candidates per point; those with the highest density are kept."""
 
 WIDEST = 1.5
-"""Scale of a Gaussian at most, in medians of all: single points far away would be large."""
+"""Largest scale of a Gaussian relative to the median, since isolated points would be large."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ class FieldSettings(InitialiserSettings):
 
     def check(self) -> None:
         sources = sorted(path.stem for path in (CONF / "lrm").glob("*.yaml"))
-        for other in ("field", "file"):  # They have no triplanes of their own.
+        for other in ("field", "file"):  # They are no LRMs.
             sources.remove(other)
         if self.source not in sources:
             raise ConfigError(f"source={self.source}: must be one of {', '.join(sources)}")
@@ -66,17 +66,17 @@ class FieldSettings(InitialiserSettings):
     def load(self, say: Callable[[str], None] = print) -> "FieldInitialiser":
         overrides = [f"model={self.model}", f"lrm={self.source}"]
         method = Method.read(compose_plain("train", overrides))
-        source = method.lrm.load(say)  # Weights that are not there are told of now.
+        source = method.lrm.load(say)  # Missing weights are reported now.
         return FieldInitialiser(self, method, "" if source is None else source.key)
 
 
 class FieldInitialiser(Initialiser):
-    """Trains a field, and takes points from where the training cameras see its surfaces.
+    """Trains a field, and takes points on its surfaces as seen by the training cameras.
 
     Args:
-        settings: For how long.
-        field: How the field is made.
-        key: Hash of the weights that the field is initialised from; empty for none.
+        settings: The settings, with the budget.
+        field: Model and training method of the field.
+        key: Hash of the weights from which the field is initialised; empty for none.
     """
 
     def __init__(self, settings: FieldSettings, field: Method, key: str) -> None:
@@ -114,14 +114,14 @@ class FieldInitialiser(Initialiser):
                     folder,
                     steps=settings.steps,
                     seconds=settings.seconds,
-                    advice=f"It belongs to {settings.model}, whose surfaces were to give points: "
+                    advice=f"It belongs to {settings.model}, trained for initial points: "
                     "set lrm.model to another model, or lrm=none",
                 )
                 found = surface_points(module, views, count, seed=method.seed)
             if not len(found.points):
                 raise ConfigError(
-                    f"lrm.steps={settings.steps}: {settings.model} shows nothing yet that points "
-                    "could lie on; raise lrm.steps, or set lrm=none"
+                    f"lrm.steps={settings.steps}: {settings.model} has no surfaces for points "
+                    "yet; raise lrm.steps, or set lrm=none"
                 )
             assert module.frame is not None
             points = place.frame.points(module.frame.to_world(found.points))
@@ -151,17 +151,17 @@ class FieldInitialiser(Initialiser):
 
 @torch.no_grad()
 def surface_points(module: RadianceModule, views: Views, count: int, *, seed: int) -> PointCloud:
-    """Points where rays through random places of the views meet what a field shows.
+    """Points on a field's surfaces, from its expected depth along random rays of the views.
 
-    A point lies at the mean distance of what its ray sees at its view's time, if that stops half of
-    the light, and has the colour that is seen. Of twice as many the denser half is kept: between
-    two surfaces there is nothing. What lies behind the field's cube is left out.
+    Rays with an opacity below 0.5 are dropped. Points have the rendered colours. Of twice as many
+    candidates the half with the highest density is kept, since expected depths may lie in empty
+    space between two surfaces. The background outside of the field's cube is ignored.
 
     Args:
-        module: A trained radiance field, whose background is taken away.
-        views: Whose cameras are looked through.
-        count: Number of points; there are fewer if the field is hardly seen.
-        seed: Source of the places.
+        module: A trained radiance field; its background is removed.
+        views: Views through whose cameras rays are drawn.
+        count: Number of points; fewer if too few rays have a surface.
+        seed: Seed of the rays.
 
     Returns:
         The points, in the field's frame, with their times.

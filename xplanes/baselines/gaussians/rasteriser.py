@@ -16,11 +16,11 @@ from xplanes.baselines.gaussians.reference import blend, project
 from xplanes.errors import XPlanesError
 
 MOST = 2**24
-"""Places in a list that float32 tells apart."""
+"""Number of consecutive integers that float32 represents exactly."""
 
 
 class GaussianError(XPlanesError, ValueError):
-    """Gaussians that cannot be drawn; the message names the tensor and the Gaussian."""
+    """Gaussians that cannot be rasterised; the message names the tensor and the Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ def rasterise(
         means: Positions in the world. [N, 3]
         quaternions: Rotations (w, x, y, z), normalised internally; below a length of 1e-12 they
             approach the identity. [N, 4]
-        scales: Standard deviations along the rotated axes in world units, 0 or more; zeros make
-            discs, needles and points. [N, 3]
+        scales: Standard deviations along the rotated axes in world units, 0 or more; with zeros
+            Gaussians become discs, lines or points. [N, 3]
         opacities: Alpha at the means, before the low-pass filter if ``antialiased``, in [0, 1]. [N]
         colours: Any number of channels. [N, C]
         camera: Pinhole camera with OpenCV axes; `Camera.from_pose` accepts the poses of `Views`.
@@ -81,7 +81,7 @@ def rasterise(
     Raises:
         GaussianError: If shapes disagree, a number is not finite or out of range, or there are too
             many Gaussians.
-        MissingExtraError: If float32 tensors lie on CUDA and gsplat is not installed.
+        MissingExtraError: If float32 tensors are on CUDA and gsplat is not installed.
 
     Source: Kerbl et al. 2023 (3D Gaussian splatting).
     """
@@ -137,7 +137,7 @@ def _draw(
     camera: Camera,
     antialiased: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The same in compiled loops."""
+    """Version of `_draw_reference` with compiled loops."""
     parts = _Project.apply(means, quaternions, scales, opacities, camera, antialiased)
     means2d, _, depths, _, radii = parts  # type: ignore[misc]
     features = torch.cat([colours, depths[:, None]], dim=1)
@@ -257,7 +257,7 @@ class _Blend(torch.autograd.Function):
 
 
 def _check(given: dict[str, Tensor], background: Tensor | None) -> None:
-    """Refuse what cannot be drawn, by name."""
+    """Check the tensors; errors name the one that is wrong."""
     count = given["means"].shape[0] if given["means"].ndim else 0
     wanted = {"means": (3,), "quaternions": (4,), "scales": (3,), "opacities": ()}
     for name, tensor in given.items():

@@ -17,11 +17,11 @@ def draw(
     camera: Camera,
     antialiased: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Draw Gaussians; arguments of `rasterise`, in float32 on CUDA.
+    """Rasterise Gaussians in float32 on CUDA; for the arguments see `rasterise`.
 
     Returns:
-        Means in pixels, a copy whose ``grad`` the backward pass fills in, and radii, as of
-            `RasterisedImage`; sums of weight times (colour, depth); and opacity.
+        Projected means (a copy whose ``grad`` the backward pass sets) and radii, see
+            `RasterisedImage`; weighted sums of colour and depth; and opacity.
             [N, 2], [N], [H, W, C + 1], [H, W]
 
     Raises:

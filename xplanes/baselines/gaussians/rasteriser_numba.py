@@ -1,9 +1,9 @@
 """Compiled loops that project and blend Gaussians on the CPU; `reference` holds the readable twin.
 
-Gaussians are projected in float64 and blended in float32. Tiles are independent, and what several
-of them add to the gradient of one Gaussian is summed in the order of the tiles: the same input
-gives the same bits, on any number of threads. Imported only when needed, since numba takes a second
-to load.
+Gaussians are projected in float64 and blended in float32. Tiles are independent, and their
+contributions to the gradient of a Gaussian are summed in a fixed order: results are deterministic
+and do not depend on the number of threads. This module is imported only when needed, since numba
+takes a second to load.
 """
 
 # ruff: noqa: D103 (rasteriser.py documents these loops)
@@ -23,45 +23,45 @@ from xplanes.baselines.gaussians.reference import (
 EXACT = {"nogil": True, "fastmath": False, "error_model": "numpy"}
 COMPILE = {**EXACT, "fastmath": {"contract"}}
 SUMS = {**EXACT, "fastmath": {"contract", "reassoc"}}
-"""For loops whose sums may take vector registers, in an order that is the same each time."""
+"""For loops with vectorised sums; their order is fixed at compile time."""
 
 TILE_WIDTH, TILE_HEIGHT = 16, 32
-"""Pixels of a tile. A row fills a vector register, or a few of them."""
+"""Size of a tile in pixels. A row fills one or more vector registers."""
 
 PIXELS = TILE_WIDTH * TILE_HEIGHT
 
 GROUP = 4
-"""Features blended at once: colour and depth. More take further passes."""
+"""Features blended per pass: colour and depth. More features need further passes."""
 
 GEOMETRY = 9
-"""What is read of a Gaussian besides its features: mean, whitening, opacity; how far it reaches, as
-the square in units of the whitening, and along x and y in pixels."""
+"""Values per Gaussian besides its features: mean, whitening and opacity; the square of its reach in
+standard deviations, and its reach along x and y in pixels."""
 
 MOMENTS = 6
-"""Sums over pixels from which the gradients of mean, whitening and opacity follow."""
+"""Sums over pixels from which the gradients of mean, whitening and opacity are computed."""
 
 HALVED = np.sqrt(0.5 / np.log(2.0))
 """Scales an offset in standard deviations so that 2^-(u^2 + v^2) is the Gaussian."""
 
 SLACK = 1.001
-"""Of what a Gaussian reaches, for the rounding of float32."""
+"""Factor on the reach of a Gaussian, as a margin for float32 rounding."""
 
-# Planes of a tile's buffer: the pixels' centres, what of the light is left for the next Gaussian
-# (0 once a pixel is done), what is left in the end, the member before which the pixel was done, and
-# opacity and features or their gradients. All lie in one array: the compiler must see that no write
-# to one changes another, or it leaves vector registers alone.
+# Planes of a tile's buffer: pixel centres, transmittance for the next Gaussian (0 once blending has
+# stopped), final transmittance, the member before which blending stopped, and opacity and features
+# or their gradients. They share one array, so that the compiler can rule out aliasing, which would
+# prevent vectorisation.
 X, Y, LIGHT, LEFT, STOP, OPACITY, F0, F1, F2, F3 = range(10)
 BEHIND = LIGHT
 PLANES = 10
 AT = tuple(np.uint64(plane * PIXELS) for plane in range(PLANES))
-"""Where the planes begin; unsigned, since numba would look for indices that count from the end."""
+"""Offsets of the planes; unsigned, since numba would check for negative indices."""
 
 f32 = np.float32
 
 
 @njit(**COMPILE)
 def _view(means, n, camera):
-    """Mean along the camera's axes."""
+    """Mean in camera coordinates."""
     x, y, z = np.float64(means[n, 0]), np.float64(means[n, 1]), np.float64(means[n, 2])
     return (
         camera[0] * x + camera[1] * y + camera[2] * z + camera[3],
@@ -72,7 +72,7 @@ def _view(means, n, camera):
 
 @njit(**COMPILE)
 def _unit(quaternions, n):
-    """Quaternion of length 1, or less where it is next to nothing, and what it was divided by."""
+    """Normalised quaternion (shorter if its length is near 0), and its divisor."""
     w, x = np.float64(quaternions[n, 0]), np.float64(quaternions[n, 1])
     y, z = np.float64(quaternions[n, 2]), np.float64(quaternions[n, 3])
     length = max(np.sqrt(w * w + x * x + y * y + z * z), LEAST_QUATERNION)
@@ -81,7 +81,7 @@ def _unit(quaternions, n):
 
 @njit(**COMPILE)
 def _axes(camera, w, x, y, z, axes):
-    """The Gaussian's axes in the camera's. [3, 3], a column for each axis"""
+    """The Gaussian's axes in camera coordinates, as columns. [3, 3]"""
     for row in range(3):
         a, b, c = camera[4 * row], camera[4 * row + 1], camera[4 * row + 2]
         axes[row, 0] = (
@@ -129,7 +129,7 @@ def project(
     peaks,
     radii,
 ):
-    """Fills the last five; ``camera`` holds the pose's rows, fx, fy, cx, cy and `slant`. [20]"""
+    """Fill the last five; ``camera`` holds the pose's rows, fx, fy, cx, cy and `slant`. [20]"""
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
     for n in prange(len(means)):
         radii[n] = 0
@@ -214,7 +214,7 @@ def project_backward(
             root[1, axis] = splat[1, axis] * np.float64(scales[n, axis])
         xx, xy, yy, determinant, area, cx, cy, cz = _covariance(root)
 
-        # W to the covariance: x has the variance `spread` where y is known, and moves by `shear`.
+        # W to the covariance: `spread` is the variance of x given y, `shear` its regression slope.
         spread, shear = determinant / yy, xy / yy
         first = 1 / np.sqrt(spread)
         d_shear = -first * d_whitening[n, 1]
@@ -236,7 +236,7 @@ def project_backward(
         if area > 0:
             cx, cy, cz = cx / area, cy / area, cz / area
 
-        # Covariance to its root, that to scales, axes and perspective.
+        # Covariance to its root, then to scales, axes and perspective.
         normal = (cx, cy, cz)
         d_axes = np.empty((3, 3))
         d_x, d_y, d_z, d_slant_x, d_slant_y = 0.0, 0.0, np.float64(d_depths[n]), 0.0, 0.0
@@ -314,7 +314,7 @@ def depth_order(depths, radii):
     count = 0
     for n in range(len(depths)):
         count += radii[n] > 0
-    bits = depths.view(np.uint32)  # Positive numbers have the order of their bits.
+    bits = depths.view(np.uint32)  # Positive floats sort like their bits.
     keys, order = np.empty(count, np.uint32), np.empty(count, np.int64)
     position = 0
     for n in range(len(depths)):
@@ -339,7 +339,7 @@ def depth_order(depths, radii):
 
 @njit(parallel=True, **COMPILE)
 def gather(order, projected, whitening, peaks, features, geometry, gathered):
-    """What blending reads, in the order of depth."""
+    """Collect the values for blending, in the order of depth."""
     for m in prange(len(order)):
         n = order[m]
         geometry[m, 0], geometry[m, 1] = projected[n, 0], projected[n, 1]
@@ -358,7 +358,7 @@ def gather(order, projected, whitening, peaks, features, geometry, gathered):
 
 @njit(**EXACT)
 def _span(low, high, size, count):
-    """Cells from the first to before the last that hold pixel centres between two places."""
+    """Half-open range of cells with pixel centres between two coordinates."""
     first = np.floor(np.ceil(low - 0.5) / size)
     last = np.floor(np.floor(high - 0.5) / size) + 1
     return np.int64(min(max(first, 0.0), count)), np.int64(min(max(last, 0.0), count))
@@ -366,9 +366,9 @@ def _span(low, high, size, count):
 
 @njit(**EXACT)
 def _edge(g, low, high):
-    """Largest x of an ellipse between two heights, all from its mean."""
+    """Largest x of an ellipse between two values of y, relative to its mean."""
     shear = -np.float64(g[3]) / g[2]
-    # The ellipse is widest at one height; towards others its edge falls off.
+    # The ellipse is widest at one y, and narrower towards others.
     widest = shear * g[8] * g[8] / g[7]
     if low <= widest <= high:
         return np.float64(g[7])
@@ -378,7 +378,7 @@ def _edge(g, low, high):
 
 @njit(**EXACT)
 def _columns(g, row, columns):
-    """Tiles of one row of tiles that a Gaussian reaches."""
+    """Range of tiles in one row of tiles that a Gaussian reaches."""
     low = max(row * TILE_HEIGHT + 0.5 - g[1], -g[8])
     high = min((row + 1) * TILE_HEIGHT - 0.5 - g[1], g[8])
     left, right = -_edge(g, -high, -low), _edge(g, low, high)
@@ -387,7 +387,7 @@ def _columns(g, row, columns):
 
 @njit(parallel=True, **EXACT)
 def count_tiles(geometry, columns, rows, counts):
-    """Tiles that each Gaussian reaches."""
+    """Number of tiles that each Gaussian reaches."""
     for m in prange(len(geometry)):
         g = geometry[m]
         first, last = _span(g[1] - g[8], g[1] + g[8], TILE_HEIGHT, rows)
@@ -400,7 +400,7 @@ def count_tiles(geometry, columns, rows, counts):
 
 @njit(parallel=True, **EXACT)
 def list_tiles(geometry, columns, rows, starts, tiles, owners):
-    """Tiles of each Gaussian, one Gaussian after the other."""
+    """List the tiles of each Gaussian, one Gaussian after the other."""
     for m in prange(len(geometry)):
         g = geometry[m]
         first, last = _span(g[1] - g[8], g[1] + g[8], TILE_HEIGHT, rows)
@@ -414,7 +414,7 @@ def list_tiles(geometry, columns, rows, starts, tiles, owners):
 
 @njit(**EXACT)
 def bin_tiles(tiles, count):
-    """Slots of each tile in the order of depth, and where each tile's begin. [P], [count + 1]"""
+    """Slots by tile, in the order of depth, and offset of each tile's slots. [P], [count + 1]"""
     starts = np.zeros(count + 1, np.int64)
     for tile in tiles:
         starts[tile + 1] += 1
@@ -430,7 +430,7 @@ def bin_tiles(tiles, count):
 
 @njit(**EXACT)
 def _power(x):
-    """2^x for x <= 0; the polynomial is within 2e-9 of 2^x from -1/2 to 1/2."""
+    """2^x for x <= 0; the polynomial has an error below 2e-9 in [-1/2, 1/2]."""
     x = max(x, f32(-100))
     whole = np.floor(x + f32(0.5))
     part = x - whole
@@ -446,20 +446,20 @@ def _power(x):
 
 @njit(**EXACT)
 def _alpha(u, v, peak):
-    """Alpha before its limits. Rounds alike going forward and back."""
+    """Alpha before its limits; the rounding is equal in the forward and backward pass."""
     return peak * _power(-(u * u + v * v))
 
 
 @njit(**EXACT)
 def _offset(flat, i, mean_x, mean_y, first, shear, last):
-    """Offset of a pixel from a mean, whitened, and along y in pixels."""
+    """Whitened offset of a pixel from a mean, and its offset along y in pixels."""
     y = flat[i + AT[Y]] - mean_y
     return first * (flat[i + AT[X]] - mean_x) + shear * y, last * y, y
 
 
 @njit(**EXACT)
 def _rows(geometry, m, top):
-    """Pixels of the tile's rows that a Gaussian reaches."""
+    """Range of pixels of the tile's rows that a Gaussian reaches."""
     middle, extent = geometry[m, 1] - top, geometry[m, 8]
     first, last = _span(middle - extent, middle + extent, 1, TILE_HEIGHT)
     return np.uint64(first * TILE_WIDTH), np.uint64(last * TILE_WIDTH)
@@ -467,7 +467,7 @@ def _rows(geometry, m, top):
 
 @njit(**EXACT)
 def _scattered(step, count):
-    """A tile for each step, so that threads with neighbouring steps share the image evenly."""
+    """Tile of a step, in an order that balances the load of threads with consecutive steps."""
     stride = np.int64(0.618 * count) + 1
     while True:
         a, b = stride, count
@@ -480,7 +480,7 @@ def _scattered(step, count):
 
 @njit(**EXACT)
 def _open(buffer, tile, columns):
-    """Centres of a tile's pixels, which see no Gaussian so far; and its corner."""
+    """Initialise the buffer of a tile, and return the tile's corner."""
     top, left = tile // columns * TILE_HEIGHT, tile % columns * TILE_WIDTH
     buffer[:] = 0
     buffer[LIGHT], buffer[LEFT], buffer[STOP] = 1, 1, np.inf
@@ -516,7 +516,7 @@ def _blend_one(flat, begin, end, member, geometry, features, m, group):
 
 @njit(parallel=True, **COMPILE)
 def blend(geometry, features, owners, members, starts, columns, image, opacity, state):
-    """Features of all pixels; for `blend_backward`, what light they let through and STOP."""
+    """Blend features; ``state`` stores final transmittance and STOP for `blend_backward`."""
     height, width, channels = image.shape
     count = len(starts) - 1
     for step in prange(count):
@@ -548,7 +548,7 @@ def blend(geometry, features, owners, members, starts, columns, image, opacity, 
 
 @njit(**SUMS)
 def _blend_one_backward(flat, begin, end, member, geometry, features, m, group, sums):
-    """Adds to ``sums``: moments of the gradient of alpha times alpha, and gradients of features."""
+    """Add to ``sums``: moments of alpha times its gradient, and gradients of features."""
     mean_x, mean_y, peak = geometry[m, 0], geometry[m, 1], geometry[m, 5]
     first, shear, last = geometry[m, 2], geometry[m, 3], geometry[m, 4]
     f0, f1 = features[m, group], features[m, group + 1]
@@ -567,7 +567,7 @@ def _blend_one_backward(flat, begin, end, member, geometry, features, m, group, 
         g0, g1 = flat[i + AT[F0]], flat[i + AT[F1]]
         g2, g3 = flat[i + AT[F2]], flat[i + AT[F3]]
         value = f0 * g0 + f1 * g1 + f2 * g2 + f3 * g3
-        # What the pixel gains as this Gaussian thickens, less what those behind it lose.
+        # Gain from a higher alpha of this Gaussian, minus the loss of those behind it.
         slope = alpha * (light * value - more * flat[i + AT[BEHIND]])
         slope = slope if whole <= f32(MOST_ALPHA) else f32(0)
         flat[i + AT[LEFT]] = light
@@ -595,7 +595,7 @@ def _blend_one_backward(flat, begin, end, member, geometry, features, m, group, 
 def blend_backward(
     geometry, features, owners, members, starts, columns, state, d_image, d_opacity, partial
 ):
-    """What each tile adds to the gradient of each of its Gaussians. [P, MOMENTS + channels]"""
+    """Contribution of each tile to the gradients of its Gaussians. [P, MOMENTS + channels]"""
     height, width, channels = d_image.shape
     count = len(starts) - 1
     for step in prange(count):
@@ -618,7 +618,7 @@ def blend_backward(
                     for channel in range(GROUP):
                         buffer[F0 + channel, i] = d_image[top + row, left + column, group + channel]
                     if group == 0:
-                        # Light of the background, which all Gaussians dim alike.
+                        # The background's share of the gradient of opacity.
                         left_over = d_opacity[top + row, left + column] * buffer[LEFT, i]
                         buffer[BEHIND, i] = -left_over
             for position in range(starts[tile + 1] - 1, starts[tile] - 1, -1):
@@ -650,7 +650,7 @@ def blend_backward(
 
 @njit(parallel=True, **COMPILE)
 def scatter(order, geometry, slots, partial, d_projected, d_whitening, d_peaks, d_features):
-    """Gradients of what was blended, summed over the tiles. Those not drawn stay as they are."""
+    """Sum the gradients over tiles. Those of Gaussians that are not drawn are unchanged."""
     for m in prange(len(order)):
         n = order[m]
         total = np.zeros(partial.shape[1])
@@ -658,7 +658,7 @@ def scatter(order, geometry, slots, partial, d_projected, d_whitening, d_peaks, 
             for entry in range(partial.shape[1]):
                 total[entry] += partial[slot, entry]
         s, su, suu, suy, sy, syy = total[0], total[1], total[2], total[3], total[4], total[5]
-        # u and v were scaled by HALVED: alpha falls as 2^-(u^2 + v^2), its logarithm by `rate`.
+        # u and v were scaled by HALVED: alpha is 2^-(u^2 + v^2), with `rate` in its derivative.
         rate = 2 * np.log(2.0)
         first, shear, last = geometry[m, 2], geometry[m, 3], geometry[m, 4]
         d_projected[n, 0] = rate * first * su

@@ -15,16 +15,16 @@ LOW_PASS = 0.3
 """Variance in pixels^2 that is added to every projected Gaussian (Kerbl et al. 2023)."""
 
 LEAST_ALPHA = 1 / 255
-"""Alpha below which a Gaussian leaves a pixel alone (Kerbl et al. 2023)."""
+"""Alpha below which a Gaussian does not affect a pixel (Kerbl et al. 2023)."""
 
 MOST_ALPHA = 0.999
-"""Alpha of a pixel at most. Kerbl et al. take 0.99, gsplat this."""
+"""Largest alpha of a pixel, as in gsplat; Kerbl et al. use 0.99."""
 
 LEAST_TRANSMITTANCE = 1e-4
-"""A pixel is done before the first Gaussian that would leave less light (Kerbl et al. 2023)."""
+"""Blending stops before the Gaussian that would lower transmittance below it (Kerbl et al.)."""
 
 LEAST_QUATERNION = 1e-12
-"""Shorter quaternions are divided by this length instead of their own: zero rotates nothing."""
+"""Shorter quaternions are divided by this length instead; zero gives the identity."""
 
 TILE = 16
 """Side of the square tiles, in pixels. The image does not depend on it."""
@@ -32,16 +32,16 @@ TILE = 16
 
 @dataclass(frozen=True)
 class Projection:
-    """Gaussians as an image plane sees them.
+    """Gaussians projected to the image plane.
 
     Attributes:
         means: In pixels from the left and the top edge. [N, 2]
         whitening: Entries xx, xy and yy of the upper triangular W with W^T W the inverse of the
             covariance: W times an offset in pixels is the offset in standard deviations. [N, 3]
-        depths: Of the means, along the camera's axis. [N]
+        depths: Depths of the means along the optical axis. [N]
         opacities: Alpha at the means. [N]
-        radii: See `RasterisedImage`; 0 for those that are not drawn, whose other numbers mean
-            nothing. int64 [N]
+        radii: See `RasterisedImage`; 0 for Gaussians that are not drawn, whose other values are
+            undefined. int64 [N]
     """
 
     means: Tensor
@@ -64,7 +64,7 @@ def project(
     parts = (means, quaternions, scales, opacities)
     with torch.no_grad():
         radii = _project(*parts, camera, antialiased, means.new_ones(len(means)).bool()).radii
-    # Those that are not drawn are replaced: what overflows there must not reach the gradients.
+    # Gaussians that are not drawn are replaced, so that their overflows do not reach gradients.
     return replace(_project(*parts, camera, antialiased, radii > 0), radii=radii)
 
 
@@ -77,7 +77,7 @@ def _project(
     antialiased: bool,
     wanted: Tensor,
 ) -> Projection:
-    """The same; of those that are not wanted, a Gaussian in front of the camera."""
+    """Project; Gaussians that are not wanted are replaced by one in front of the camera."""
     world_to_camera = camera.world_to_camera.to(means)
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     x, y, z = (means @ rotation.T + translation).unbind(-1)
@@ -90,8 +90,8 @@ def _project(
     along_y = torch.stack([zero, camera.fy / z, -camera.fy * slant_y / z], dim=-1)
     jacobian = torch.stack([along_x, along_y], dim=1)
     root = jacobian @ rotation @ rotations(quaternions) * scales[:, None, :]  # [N, 2, 3]
-    # The covariance is root root^T + LOW_PASS. Its determinant is made of areas, without a
-    # difference of large numbers, however thin the Gaussian.
+    # The covariance is root root^T + LOW_PASS. Its determinant is computed from areas, which avoids
+    # cancellation for thin Gaussians.
     area = torch.linalg.cross(root[:, 0], root[:, 1]).norm(dim=-1)
     xx, yy = root.square().sum(-1).unbind(-1)
     determinant = area.square() + LOW_PASS * (xx + yy) + LOW_PASS**2
@@ -126,9 +126,9 @@ def rotations(quaternions: Tensor) -> Tensor:
 
 
 def extents(whitening: Tensor, opacities: Tensor) -> Tensor:
-    """How far alpha is `LEAST_ALPHA` or more along x and y, in pixels; 0 where nowhere. [N, 2]
+    """Half sizes in pixels of the boxes in which alpha is at least `LEAST_ALPHA`. [N, 2]
 
-    At most 3.33 standard deviations, those of an opacity of 1.
+    They are 0 if alpha is below it everywhere, and at most 3.33 standard deviations.
     """
     first, shear, last = whitening.unbind(-1)
     reach = (2 * (opacities / LEAST_ALPHA).clamp(min=1).log()).sqrt()
@@ -138,11 +138,11 @@ def extents(whitening: Tensor, opacities: Tensor) -> Tensor:
 
 
 def blend(projection: Projection, features: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Blend projected Gaussians from front to back, one tile of the image after the other.
+    """Blend projected Gaussians from front to back, tile by tile.
 
     Args:
-        projection: Gaussians of equal depth keep their order.
-        features: What is blended. [N, K]
+        projection: Projected Gaussians; those of equal depth keep their order.
+        features: Features to blend. [N, K]
         camera: Size of the image.
 
     Returns:

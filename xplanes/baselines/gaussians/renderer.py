@@ -1,4 +1,4 @@
-"""Cameras and Gaussians to pixels, for training and for images."""
+"""Renders Gaussians, for training and for images."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -21,15 +21,15 @@ from xplanes.streams import TrainingState
 
 
 def camera_in(frame: Frame, camera: PosedCamera) -> Camera:
-    """A camera of the world as a rasteriser takes it, in a field's frame.
+    """Convert a camera in the world to the rasteriser's, in a field's frame.
 
     Raises:
         SceneError: If its lens distorts the image.
     """
     if camera.lens is not None:
         raise SceneError(
-            "the images are distorted by their lenses, and Gaussians are projected by pinholes "
-            "alone: undistort the images (COLMAP's image_undistorter), or choose a model that "
+            "the images have lens distortion, but Gaussians are rasterised with pinhole cameras "
+            "only: undistort the images (COLMAP's image_undistorter), or choose a model that "
             "renders rays, such as model=six_planes"
         )
     pose = torch.eye(4)
@@ -47,10 +47,10 @@ def camera_in(frame: Frame, camera: PosedCamera) -> Camera:
 
 @dataclass(frozen=True)
 class RasterisedRendering(Rendering):
-    """What the rays of a view see of Gaussians, pixel by pixel.
+    """A rendering of all pixels of a view.
 
     Attributes:
-        image: The same as the rasteriser gives it.
+        image: The rasteriser's result.
     """
 
     image: RasterisedImage
@@ -60,7 +60,7 @@ class GaussianRenderer(Renderer):
     """Projects and blends Gaussians.
 
     Args:
-        field: Gaussians in time.
+        field: The Gaussians.
         antialiased: See `rasterise`.
     """
 
@@ -74,7 +74,7 @@ class GaussianRenderer(Renderer):
     def draw(
         self, field: Gaussians, camera: Camera, time: float, background: Tensor
     ) -> RasterisedImage:
-        """Draw the Gaussians of one time; gradients reach them.
+        """Rasterise the Gaussians at one time; gradients reach them.
 
         Raises:
             GaussianError: If a parameter is not finite.
@@ -105,7 +105,7 @@ class GaussianRenderer(Renderer):
 
 
 def _slants(camera: Camera) -> Tensor:
-    """Distance along each pixel's ray for one unit of depth along the camera's axis. [H, W]"""
+    """Distance along each pixel's ray per unit of depth along the optical axis. [H, W]"""
     across = (torch.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     down = (torch.arange(camera.height) + 0.5 - camera.cy) / camera.fy
     return (1 + across.square() + down.square()[:, None]).sqrt()
@@ -127,10 +127,10 @@ class RasteriserSettings(SamplerSettings):
 
 
 class Rasteriser(Sampler):
-    """Draws whole views, and keeps the gradients by which Gaussians are added.
+    """Renders whole views, and collects the gradients that densification uses.
 
     Args:
-        renderer: Draws them.
+        renderer: The renderer.
         frame: The field's frame.
     """
 
@@ -165,7 +165,7 @@ class Rasteriser(Sampler):
 
     @torch.no_grad()
     def observe(self, rendering: Any) -> None:
-        """Add the length of each projected mean's gradient, half an image's side being 1."""
+        """Add the norms of the projected means' gradients, in units of half the image's side."""
         image, field = rendering.image, self._renderer.field
         height, width = image.opacity.shape
         half = image.means2d.new_tensor([0.5 * width, 0.5 * height])

@@ -1,4 +1,4 @@
-"""Spacetime Gaussians (Li et al., CVPR 2024), lite: each Gaussian has its time and its path."""
+"""Spacetime Gaussians (Li et al., CVPR 2024), lite: Gaussians with a lifetime and a trajectory."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -36,7 +36,7 @@ class SpacetimeGaussiansSettings(GaussiansSettings):
 
 
 class SpacetimeGaussiansModel(GaussiansModel):
-    """Errors of colours and adaptive density control.
+    """Colour errors and adaptive density control.
 
     Args:
         settings: Learning rates, schedule and weights.

@@ -11,13 +11,13 @@ from xplanes.fields.background import RADIUS
 from xplanes.fields.base import ViewDependentField
 
 GEOMETRY = 15
-"""Features that the density network hands to the colour network."""
+"""Number of features that the density network passes to the colour network."""
 
 
 def contract_cube(points: Tensor) -> Tensor:
-    """Draw all of space into the cube [-2, 2]^3; the cube [-1, 1]^3 stays as it is.
+    """Contract all of space to the cube [-2, 2]^3; the cube [-1, 1]^3 is unchanged.
 
-    As `xplanes.fields.background.contract`, with the largest coordinate in place of the length.
+    Like `xplanes.fields.background.contract`, with the maximum norm instead of the Euclidean one.
 
     Args:
         points: Positions in the field's frame, finite. [..., 3]
@@ -32,12 +32,12 @@ def contract_cube(points: Tensor) -> Tensor:
 
 
 class HybridDecoder(nn.Module):
-    """Two MLPs: features to density, and with the direction's harmonics to colour.
+    """Two MLPs: one for density, one for colour from its features and the direction's harmonics.
 
     Args:
         features: Columns of the input.
         width: Neurons of the hidden layers, one for density and two for colour.
-        precision: Of the matrix products.
+        precision: Precision of the matrix products.
 
     Source: K-Planes, hybrid decoder.
     """
@@ -48,7 +48,7 @@ class HybridDecoder(nn.Module):
         self.tint = PaddedMLP([16 + GEOMETRY, width, width, 3], precision=precision)
 
     def geometry(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Density's logit, and features for the colour. [N, F] -> [N], [N, 15]"""
+        """Density logit, and features for the colour. [N, F] -> [N], [N, 15]"""
         out = self.density(features)
         return out[:, GEOMETRY], out[:, :GEOMETRY]
 
@@ -58,12 +58,12 @@ class HybridDecoder(nn.Module):
 
 
 class ExplicitDecoder(nn.Module):
-    """One linear map to density; colour is linear in the features for each direction.
+    """Density is linear in the features, and so is colour, with a learned basis per direction.
 
     Args:
         features: Columns of the input.
         width: Neurons of the hidden layers of the network from direction to colour basis.
-        precision: Of the matrix products.
+        precision: Precision of the matrix products.
 
     Source: K-Planes, explicit decoder.
     """
@@ -76,7 +76,7 @@ class ExplicitDecoder(nn.Module):
         self.basis = PaddedMLP([3, *[width] * self.HIDDEN, 3 * features], precision=precision)
 
     def geometry(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Density's logit, and the features. [N, F] -> [N], [N, F]"""
+        """Density logit, and the features. [N, F] -> [N], [N, F]"""
         return self.density(features)[:, 0], features
 
     def colour(self, geometry: Tensor, directions: Tensor) -> Tensor:
@@ -86,13 +86,13 @@ class ExplicitDecoder(nn.Module):
 
 
 class KPlanes(ViewDependentField):
-    """A dynamic radiance field of multiplied planes.
+    """A dynamic radiance field of products of planes.
 
-    Unlike X-Planes it has values outside its cube: those at the planes' borders.
+    Unlike X-Planes it is not empty outside its cube: planes are extrapolated from their borders.
 
     Args:
-        products: Planes.
-        decoder: From their features to density and colour.
+        products: The planes.
+        decoder: Decoder from their features to density and colour.
         unit: World units per unit of the field's frame; the decoder's density is per world unit.
         contracted: Whether the planes cover all of space, contracted, instead of the cube.
 
@@ -145,15 +145,15 @@ class KPlanes(ViewDependentField):
 
 
 class DensityField(nn.Module):
-    """A small field of density alone, which tells where a larger one should be sampled.
+    """A small density field that proposes samples for a larger field.
 
     Args:
-        products: Planes.
+        products: The planes.
         width: Neurons of the hidden layer.
-        linear: Whether the layers have no activation between them.
+        linear: Whether there is no activation between the layers.
         unit: World units per unit of the field's frame.
-        precision: Of the matrix products.
-        contracted: As for `KPlanes`.
+        precision: Precision of the matrix products.
+        contracted: See `KPlanes`.
 
     Source: K-Planes, released code; Mip-NeRF 360, Section 3.
     """

@@ -96,7 +96,7 @@ class KPlanesSettings(ModelSettings):
 
 
 class KPlanesModel(Model):
-    """The colour's error, smooth planes, and time planes near 1 where nothing moves.
+    """Colour error, smoothness of the planes, and distance of time planes from 1.
 
     Args:
         settings: Learning rate and weights.

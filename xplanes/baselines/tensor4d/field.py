@@ -1,4 +1,4 @@
-"""Tensor4D: a surface in canonical space with a flow that leads there, or a density."""
+"""Tensor4D: a surface in canonical space with a flow that maps points there, or a density."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -16,14 +16,14 @@ HIDDEN = 3
 """Hidden layers of all networks."""
 
 OUTSIDE = 1.0
-"""Signed distance of what is left out: far from the surface, where nothing is seen."""
+"""Signed distance of masked points: far outside of the surface."""
 
 DENSITY_SCALE, DENSITY_START = 25.0, -3.0
-"""Of the density that stands in for the surface: softplus of the logit, as X-Planes have it."""
+"""Scale and offset of the density of `Tensor4DDensity`, a softplus of the logit as in X-Planes."""
 
 
 class SkipNetwork(nn.Module):
-    """Hidden layers after the first of which features, and the input once more, are let in.
+    """MLP in which features and the input are concatenated after the first hidden layer.
 
     Args:
         inputs: Columns of the input; the first three are a position.
@@ -33,7 +33,7 @@ class SkipNetwork(nn.Module):
         radius: The first output is initialised to the distance from a sphere of this radius
             around the origin; None for a random initialisation.
 
-    Source: Tensor4D, released code; NeuS; IGR (start).
+    Source: Tensor4D, released code; NeuS; IGR (initialisation).
     """
 
     def __init__(
@@ -62,7 +62,7 @@ def _start_as_sphere(layers: list[nn.Linear], inputs: int, radius: float) -> Non
     for layer in layers[:-1]:
         nn.init.normal_(layer.weight, 0, math.sqrt(2 / layer.out_features))
         nn.init.zeros_(layer.bias)
-    # Encodings would bend the sphere.
+    # Encodings would distort the sphere.
     layers[0].weight[:, 3:] = 0
     layers[1].weight[:, -(inputs - 3) :] = 0
     last = layers[-1]
@@ -79,21 +79,21 @@ def _colour_network(inputs: int, width: int) -> nn.Sequential:
 
 
 class Tensor4D(SurfaceField):
-    """Signed distance and colour in canonical space, and the flow from each timestep to it.
+    """Signed distance and colour in canonical space, and the flow from each time to it.
 
     Args:
         planes: Planes of the canonical space.
         flow_planes: Planes of the flow; None for a static scene.
         width: Neurons of the hidden layers.
-        octaves: Frequencies for positions, times and directions.
-        radius: Of the initial sphere.
-        sharpness: The surface's initial width is exp(-10 times this).
+        octaves: Frequencies of the encodings of positions, times and directions.
+        radius: Radius of the initial sphere.
+        sharpness: Sets the initial width of the surface, exp(-10 * sharpness).
 
     Source: Tensor4D, released code.
     """
 
     COMPRESSED = 32
-    """Columns that remain of each group of the flow's planes."""
+    """Columns of each group of the flow's planes after compression."""
 
     def __init__(
         self,
@@ -142,7 +142,7 @@ class Tensor4D(SurfaceField):
         return (10 * self.steepness).exp().clamp(1e-6, 1e6)
 
     def canonical(self, points: Tensor, times: Tensor) -> Tensor:
-        """Where points lie in canonical space, that of time 0. [N, 3], [N] -> [N, 3]"""
+        """Map points to canonical space, which is that of time 0. [N, 3], [N] -> [N, 3]"""
         if self.flow is None or self.compression is None or self.flow_planes is None:
             return points
         features = self.compression(self.flow_planes(points, times))
@@ -151,7 +151,7 @@ class Tensor4D(SurfaceField):
         return points + self.flow(values, features) * (times > 0)[:, None]
 
     def features(self, places: Tensor) -> Tensor:
-        """What the planes hold at canonical places. [N, 3] -> [N, F]"""
+        """Features of the planes at canonical points. [N, 3] -> [N, F]"""
         return torch.cat(self.canonical_planes(places, torch.zeros_like(places[:, 0])), dim=1)
 
     def distance(self, places: Tensor) -> tuple[Tensor, Tensor]:
@@ -162,15 +162,15 @@ class Tensor4D(SurfaceField):
     def distance_and_slope(
         self, points: Tensor, times: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The distance at a timestep and its gradient there, through the flow; all can be trained.
+        """Signed distance and its gradient through the flow; all results are differentiable.
 
         Args:
-            points: [N, 3]
-            times: [N]
+            points: Positions. [N, 3]
+            times: Times from 0 to 1. [N]
 
         Returns:
-            Distance [N], gradient by the points [N, 3], features for the colour [N, width], and the
-            points in canonical space [N, 3].
+            Distance [N], gradient with respect to the points [N, 3], features for the colour
+            [N, width], and the points in canonical space [N, 3].
         """
         trained = torch.is_grad_enabled()
         with torch.enable_grad():
@@ -185,7 +185,7 @@ class Tensor4D(SurfaceField):
     def colour(
         self, points: Tensor, slopes: Tensor, features: Tensor, directions: Tensor
     ) -> Tensor:
-        """Colour at points of a timestep. [N, 3], [N, 3], [N, width], [N, 3] -> [N, 3]"""
+        """Colour at points of one time. [N, 3], [N, 3], [N, width], [N, 3] -> [N, 3]"""
         seen = octaves(directions, self.octaves[2])
         return self.tint(torch.cat([points, seen, slopes, features], dim=1))
 
@@ -201,29 +201,29 @@ class Tensor4D(SurfaceField):
 
 
 class MaskedSurface(Masked):
-    """A surface that is left out in some places."""
+    """A surface from which some regions are removed."""
 
     def distance_and_slope(self, points: Tensor, times: Tensor) -> tuple[Tensor, ...]:
-        """As `Tensor4D.distance_and_slope`."""
+        """See `Tensor4D.distance_and_slope`."""
         distance, *others = self._field.distance_and_slope(points, times)
         return torch.where(self._keep(points), distance, OUTSIDE), *others
 
 
 class Tensor4DDensity(ViewDependentField):
-    """The nine planes of Tensor4D and its networks, with a density in place of the surface.
+    """The nine planes of Tensor4D and its networks, with a density instead of the surface.
 
     This is not the published model: it has no surface, no normals and no flow.
 
     Args:
         planes: Nine planes, or three for a static scene.
         width: Neurons of the hidden layers.
-        octaves: Frequencies for positions, times and directions.
+        octaves: Frequencies of the encodings of positions, times and directions.
 
     Source: Tensor4D, released code.
     """
 
     COMPRESSED = 48
-    """Columns that remain of each group of planes."""
+    """Columns of each group of planes after compression."""
 
     def __init__(
         self,

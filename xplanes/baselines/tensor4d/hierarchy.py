@@ -1,4 +1,4 @@
-"""Planes of two levels, side by side: what Tensor4D reads from."""
+"""Planes of two levels, with their features concatenated, as in Tensor4D."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 Groups = tuple[tuple[str, ...], ...]
-"""Planes that belong together; every group owns its planes."""
+"""Names of planes by group; groups do not share planes."""
 
 STATIC: Groups = (("yz",), ("xz",), ("xy",))
 DYNAMIC: Groups = (("yz", "yt", "zt"), ("xz", "xt", "zt"), ("xy", "xt", "yt"))
@@ -16,7 +16,7 @@ DYNAMIC: Groups = (("yz", "yt", "zt"), ("xz", "xt", "zt"), ("xy", "xt", "yt"))
 AXES = "xyzt"
 
 EARLIEST, LATEST = -0.95, 0.95
-"""Where times 0 and 1 lie on the axis of time, which runs from -1 to 1."""
+"""Coordinates of times 0 and 1 along the planes' time axis, which covers [-1, 1]."""
 
 
 @dataclass(frozen=True)
@@ -35,17 +35,17 @@ class Level:
 
 
 def bilinear(plane: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
-    """Read a plane between its texels' centres, the border's value beyond.
+    """Bilinear interpolation of a plane, with coordinates clamped at the border.
 
-    Unlike ``grid_sample`` it has second derivatives, which normals need to be trained.
+    Unlike ``grid_sample`` it has second derivatives, which the training of normals needs.
 
     Args:
-        plane: Channels last. [H, W, C]
-        columns: Coordinates, -1 and 1 being the centres of the first and last texel. [N]
-        rows: The same. [N]
+        plane: Plane with channels last. [H, W, C]
+        columns: Coordinates; -1 and 1 are the centres of the first and last texel. [N]
+        rows: Coordinates along the rows, likewise. [N]
 
     Returns:
-        [N, C]
+        Interpolated features. [N, C]
     """
     height, width, channels = plane.shape
     across = ((columns + 1) / 2 * (width - 1)).clamp(0, width - 1)
@@ -65,14 +65,14 @@ def bilinear(plane: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
 
 
 class HierarchicalPlanes(nn.Module):
-    """For each group its planes of all levels, side by side. They are initialised to zero.
+    """Planes of several levels; features of a group are concatenated. Initialised to zero.
 
     Args:
         groups: Names of the planes, "ab" with axis a along its columns and b along its rows.
-        levels: From coarse to fine.
-        blur: Texels to which planes are averaged down while ``blurred``.
+        levels: Sizes of the levels, from coarse to fine.
+        blur: Texels per axis to which planes are downsampled while ``blurred``.
 
-    `show` says which levels are read, and whether blurred; both belong to the state.
+    `show` chooses the levels that are used and the downsampling; both are part of the state.
 
     Source: Tensor4D, released code.
     """
@@ -96,15 +96,15 @@ class HierarchicalPlanes(nn.Module):
                     self.planes[self._key(number, group, name)] = nn.Parameter(plane)
 
     def _read_buffers(self) -> None:
-        """Keep Python's values of the buffers, for which a GPU need not be waited for."""
+        """Copy the buffers to Python values, so that lookups need not synchronise with a GPU."""
         self._fine, self._blurred = bool(self.fine), bool(self.blurred)
 
     def show(self, *, fine: bool, blurred: bool) -> None:
-        """Choose what is read.
+        """Choose the levels that are used, and the downsampling.
 
         Args:
-            fine: Whether levels beyond the first are read; zeros stand in for them otherwise.
-            blurred: Whether planes are averaged down.
+            fine: Whether levels beyond the first are used; otherwise their features are zeros.
+            blurred: Whether planes are downsampled before the lookup.
         """
         if (fine, blurred) != (self._fine, self._blurred):
             self._fine, self._blurred = fine, blurred
@@ -159,12 +159,12 @@ class HierarchicalPlanes(nn.Module):
 
 
 class Compression(nn.Module):
-    """A small network for each group, so that what follows sees fewer features.
+    """A small network per group that reduces the number of features.
 
     Args:
         groups: Number of groups.
         inputs: Columns of each group.
-        outputs: Columns that remain of each.
+        outputs: Columns of each group after compression.
         width: Neurons of the hidden layer.
 
     Source: Tensor4D, released code.

@@ -1,4 +1,4 @@
-"""Tensor4D (Shao et al., CVPR 2023) as in the released code: a surface and a flow; or a density."""
+"""Tensor4D (Shao et al., CVPR 2023) as in the released code, and a variant with a density."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -69,7 +69,7 @@ class Tensor4DDensitySettings(ModelSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class Tensor4DLoss(Settings):
-    """Weights of the terms of the loss beyond the colour's error."""
+    """Weights of the terms of the loss beyond the colour error."""
 
     masked: bool  # Restrict the colour loss to the silhouettes.
     eikonal: Weight  # Weight of the eikonal loss.
@@ -92,7 +92,7 @@ class Tensor4DSettings(Tensor4DDensitySettings):
     def check(self) -> None:
         if not isinstance(self.sampler, NeusSettings):
             raise ConfigError(
-                f"sampler.name={self.sampler.name}: a surface needs samples near it; set "
+                f"sampler.name={self.sampler.name}: the surface needs the sampler of NeuS; set "
                 "model/sampler=neus, or model=tensor4d_density"
             )
 
@@ -110,7 +110,7 @@ class Tensor4DSettings(Tensor4DDensitySettings):
 
 
 class Tensor4DDensityModel(Model):
-    """The colour's error, and planes that are read coarsely at first.
+    """Colour error, and the schedule of coarse and fine planes.
 
     Args:
         settings: Learning rates and schedule.
@@ -161,7 +161,7 @@ class Tensor4DDensityModel(Model):
 
 
 class Tensor4DModel(Tensor4DDensityModel):
-    """Colours in the silhouettes, silhouettes, distances that are distances, smooth features.
+    """Colour error, silhouette loss, eikonal loss and smoothness of features.
 
     Args:
         settings: Learning rates, schedule and weights.
@@ -207,7 +207,7 @@ class Tensor4DModel(Tensor4DDensityModel):
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureSmoothness(LossTerm):
-    """Change of an X-Planes field's features over a small distance, where rays see something.
+    """Change of an X-Planes field's features over a small distance, weighted as in compositing.
 
     Source: Tensor4D, released code.
     """
@@ -231,14 +231,14 @@ class FeatureSmoothness(LossTerm):
 
 
 def _aside(places: Tensor, distance: float, state: TrainingState) -> Tensor:
-    """Steps of one length in random directions. [N, 3] -> [N, 3]"""
+    """Offsets of a fixed length in random directions. [N, 3] -> [N, 3]"""
     generator = state.generator(places.device, Stream.NEARBY)
     steps = torch.randn(places.shape, generator=generator, device=places.device)
     return F.normalize(steps, dim=1) * distance
 
 
 def masked_colour_error(colour: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """Absolute errors summed over channels, mean over the rays in a mask. [R, 3] x 2, [R] -> []
+    """Absolute error, summed over channels, mean over rays in a mask. [R, 3], [R, 3], [R] -> []
 
     Source: NeuS and Tensor4D, released code.
     """
@@ -247,36 +247,36 @@ def masked_colour_error(colour: Tensor, target: Tensor, mask: Tensor) -> Tensor:
 
 
 def silhouette_error(opacity: Tensor, mask: Tensor) -> Tensor:
-    """Cross entropy between opacities, kept from 0 and 1 by 0.001, and a mask. [R], [R] -> []
+    """Cross entropy of opacities, clamped to [0.001, 0.999], with a mask. [R], [R] -> []
 
     Source: NeuS and Tensor4D, released code.
     """
-    # Written out: torch's own stops the program at a NaN, where training leaves out the step.
+    # torch's function raises an error at NaN on some devices, but training skips such steps.
     light = opacity.clamp(1e-3, 1 - 1e-3)
     return -(mask * light.log() + (1 - mask) * (1 - light).log()).mean()
 
 
 def eikonal_error(slopes: Tensor, samples: int) -> Tensor:
-    """Mean squared distance of gradients from length 1. [M, 3] -> []
+    """Mean squared deviation of gradient norms from 1. [M, 3] -> []
 
     Args:
         slopes: Gradients of the samples in the field's cube. [M, 3]
-        samples: Number of all samples: those outside the cube count as right.
+        samples: Number of all samples: the error outside the cube is 0.
 
     Source: NeuS; IGR; Tensor4D, released code.
     """
-    # A gradient of zero has no direction in which its length could grow.
+    # The constant avoids the infinite derivative of the square root at 0.
     lengths = (slopes.square().sum(dim=1) + 1e-12).sqrt()
     return (lengths - 1).square().sum() / max(1, samples)
 
 
 def feature_change(here: Tensor, nearby: Tensor, weights: Tensor, rays: int) -> Tensor:
-    """Squared change of features over a small distance: weighted sum along rays, mean over them.
+    """Squared change of features over a small distance: weighted sum along rays, mean over rays.
 
     Args:
         here: Features at samples. [N, F]
-        nearby: Features close by. [N, F]
-        weights: Share of its ray's light that each sample sends, without gradient. [N]
+        nearby: Features at nearby points. [N, F]
+        weights: Compositing weight of each sample, without gradient. [N]
         rays: Number of rays.
 
     Source: Tensor4D, released code.

@@ -1,4 +1,4 @@
-"""Rays through a signed distance: opacity rises where the surface is crossed from outside."""
+"""Renders signed distances as NeuS does: opacity where a ray enters the surface from outside."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,19 +17,19 @@ from xplanes.settings import Count, Positive
 from xplanes.streams import TrainingState
 
 TINY = 1e-5
-"""Keeps quotients of vanishing opacities finite."""
+"""Added to denominators and weights that may be 0."""
 
 
 @dataclass(frozen=True)
 class SurfaceRendering(Rendering):
-    """What rays see, and the M of its N samples that lie in the field's cube.
+    """A rendering with the M of its N samples that are in the field's cube.
 
     Attributes:
-        places: Where these are in canonical space. [M, 3]
-        slopes: Gradient of the distance by their points, through the flow. [M, 3]
-        weights: Share of its ray's light that each of them sends, without gradient. [M]
+        places: Positions of these samples in canonical space. [M, 3]
+        slopes: Gradients of the distance with respect to the samples, through the flow. [M, 3]
+        weights: Compositing weight of each of them, without gradient. [M]
 
-    ``density`` is the depth of these below the surface, minus their distance. [M]
+    ``density`` is the depth of these samples below the surface, the negative distance. [M]
     """
 
     places: Tensor
@@ -40,13 +40,13 @@ class SurfaceRendering(Rendering):
 def section_opacity(
     distance: Tensor, change: Tensor, lengths: Tensor, sharpness: Tensor | float
 ) -> Tensor:
-    """Opacity of sections of rays, from the distance in their middle.
+    """Opacity of sections of rays, from the signed distance at their midpoints.
 
     Args:
-        distance: Signed distance in the middle. [...]
-        change: Its derivative along the ray, not above 0. [...]
+        distance: Signed distance at the midpoint. [...]
+        change: Derivative of the distance along the ray, at most 0. [...]
         lengths: Length of the section. [...]
-        sharpness: Steepness of the logistic that makes opacity of distance.
+        sharpness: Steepness of the logistic function from distance to opacity.
 
     Returns:
         From 0 to 1. [...]
@@ -60,19 +60,19 @@ def section_opacity(
 
 
 def weights_of(opacity: Tensor) -> Tensor:
-    """Share of the light that each sample of a ray sends. [R, S] -> [R, S]"""
+    """Compositing weights of samples from their opacities. [R, S] -> [R, S]"""
     through = torch.cat([torch.ones_like(opacity[:, :1]), 1 - opacity + 1e-7], dim=1)
     return opacity * through.cumprod(dim=1)[:, :-1]
 
 
 class NeusRenderer(RayRenderer):
-    """Equal steps through the unit sphere's depth, then more where they find the surface.
+    """Uniform samples over the diameter of the unit sphere, then importance samples at the surface.
 
     Args:
         field: Has ``canonical``, ``distance``, ``distance_and_slope``, ``colour``, ``sharpness``.
-        samples: Equal steps.
-        more: Samples added.
-        coarse_sharpness: Sharpness at which they are placed.
+        samples: Number of uniform samples.
+        more: Number of importance samples.
+        coarse_sharpness: Sharpness for the weights of the importance sampling.
 
     Source: NeuS and Tensor4D, released code.
     """
@@ -102,7 +102,7 @@ class NeusRenderer(RayRenderer):
         distances = ends + lengths / 2
         shape = distances.shape
         samples = dense_samples(_points(origins, directions, distances), distances)
-        # Outside the cube nothing is seen, and nothing need be asked.
+        # The field is empty outside the cube and is not evaluated there.
         inside = (samples.points.abs() <= 1).all(dim=1).nonzero()[:, 0]
         points, ray = samples.points[inside], samples.ray[inside]
         facing = directions[ray]
@@ -141,7 +141,7 @@ class NeusRenderer(RayRenderer):
             origins: [R, 3]
             directions: Unit directions. [R, 3]
             times: [R]
-            jitter: Moves each ray's first samples by up to half a step; from 0 to 1. [R]
+            jitter: Random numbers from 0 to 1 that move uniform samples by up to half a step. [R]
         """
         closest = -(origins * directions).sum(dim=1, keepdim=True)
         steps = torch.linspace(-1, 1, self.samples, device=origins.device)
@@ -153,7 +153,7 @@ class NeusRenderer(RayRenderer):
         distance = field.distance(places)[0].view_as(ends)
         lengths = ends.diff(dim=1)
         change = distance.diff(dim=1) / (lengths + TINY)
-        # The steeper of two neighbours, so that a surface hit at a flat angle is not missed.
+        # The steeper of two neighbours, so that surfaces at grazing angles are not missed.
         before = torch.cat([torch.zeros_like(change[:, :1]), change[:, :-1]], dim=1)
         near = points.view(*ends.shape, 3).norm(dim=2) < 1
         change = torch.minimum(before, change).clamp(-1e3, 0) * (near[:, 1:] | near[:, :-1])
@@ -179,7 +179,7 @@ class NeusSettings(SamplerSettings):
     def require(self, field: RadianceField | type[RadianceField]) -> None:
         if not hasattr(field, "distance_and_slope"):
             raise ConfigError(
-                f"model.sampler.name={self.name}: needs a field with a surface, as Tensor4D's; set "
+                f"model.sampler.name={self.name}: needs a field with a surface, like Tensor4D; set "
                 "model/sampler=occupancy or proposal"
             )
 
@@ -195,10 +195,10 @@ class NeusSettings(SamplerSettings):
 
 
 class NeusSampler(Sampler):
-    """Nothing to update: the field's own distance places the samples.
+    """Places samples by the field's signed distance; it has no state to update.
 
     Args:
-        renderer: Places them.
+        renderer: The renderer.
     """
 
     def __init__(self, renderer: NeusRenderer) -> None:

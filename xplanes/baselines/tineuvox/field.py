@@ -1,4 +1,4 @@
-"""TiNeuVox: a grid of features that a deformation looks into, and small networks."""
+"""TiNeuVox: a deformation network, a feature grid in canonical space, and small decoders."""
 
 import math
 from collections.abc import Mapping
@@ -13,10 +13,10 @@ from xplanes.fields.background import Background
 from xplanes.fields.base import ViewDependentField
 
 STRIDES = (1, 2, 4)
-"""The grid is read at every cell, every second and every fourth."""
+"""Spacings of the three interpolations of the grid, in grid points."""
 
 PER_CHANNEL = 5
-"""Numbers per channel that a feature's encoding, and the time's, come to at two octaves."""
+"""Time features per channel of the grid: as many as a feature encoded with two octaves has."""
 
 
 class TiNeuVox(ViewDependentField):
@@ -24,19 +24,19 @@ class TiNeuVox(ViewDependentField):
 
     Args:
         box: Least and largest corner of the grid, in world units. [2, 3]
-        resolution: Cube root of the number of cells.
+        resolution: Cube root of the final number of cells.
         channels: Channels of a cell.
         width: Neurons of the hidden layers.
-        octaves: Frequencies for positions, times, directions and features.
+        octaves: Frequencies of the encodings of positions, times, directions and features.
         alpha: Initial opacity of one cell of the final grid.
-        halvings: How often the number of cells is halved for the initial grid.
-        moves: Whether points are moved to canonical space; False for a static scene.
+        halvings: Number of halvings of the number of cells for the initial grid.
+        moves: Whether points are deformed to canonical space; False for a static scene.
         unit: World units per unit of the field's frame.
-        precision: Of the matrix products.
-        background: What lies behind the grid's box; None for a plain colour.
+        precision: Precision of the matrix products.
+        background: Background outside of the grid's box; None for a plain colour.
 
     Attributes:
-        count: Number of cells of the grid as it is now.
+        count: Current number of cells of the grid.
 
     Source: TiNeuVox, released code.
     """
@@ -86,13 +86,13 @@ class TiNeuVox(ViewDependentField):
         self.register_load_state_dict_post_hook(lambda field, _: field._read_buffers())
 
     def _read_buffers(self) -> None:
-        """Keep on the host what each step asks for: a GPU would be waited for."""
+        """Copy buffers to the host once, so that steps need not synchronise with the GPU."""
         self.count = int(self.voxels)
         self._corners = self.box.double().cpu()
 
     @property
     def planes(self) -> Mapping[str, Tensor]:
-        """Slices through the middle of the grid. [C, rows, columns] each"""
+        """Central slices of the grid. [C, rows, columns] each"""
         grid = self.grid[0]
         x, y, z = (size // 2 for size in grid.shape[1:])
         return {
@@ -135,8 +135,8 @@ class TiNeuVox(ViewDependentField):
         self.count = voxels
 
     def read(self, places: Tensor) -> Tensor:
-        """The grid at three spacings, zero outside. World positions [N, 3] -> [N, 3 C]"""
-        # Filled up so that the corners of all three grids fall together.
+        """Interpolate the grid at three spacings, zero outside. World points [N, 3] -> [N, 3 C]"""
+        # Padded so that the corners of all three grids coincide.
         fill = [-(size - 1) % STRIDES[-1] for size in self.grid.shape[:1:-1]]
         grid = F.pad(self.grid, [n for size in fill for n in (0, size)])
         low, high = self.box
@@ -160,7 +160,7 @@ class TiNeuVox(ViewDependentField):
             features = self.trunk(torch.cat([read, time_features, encoded], dim=1)).relu()
             logit = self.density(features)[:, 0]
         per_cell = F.softplus(logit.to(points.dtype) + self.shift)
-        # The published density counts per side of a cell of the finished grid.
+        # As in the released code, density is per side of a cell of the final grid.
         return per_cell * (self.unit / self._cell(self.resolution**3)), features
 
     def colour(self, features: Tensor, directions: Tensor) -> Tensor:
@@ -178,13 +178,13 @@ class TiNeuVox(ViewDependentField):
 
     def _size(self, voxels: int) -> list[int]:
         low, high = self._corners
-        # Whole cells, but a rounding error must not cost one.
+        # Round down, with a tolerance for rounding errors.
         sides = (high - low) / self._cell(voxels) + 1e-4
         return [max(2, int(side)) for side in sides.tolist()]
 
 
 def _fit_grid(field: TiNeuVox, state: Mapping[str, Any], prefix: str, *_rest: Any) -> None:
-    """Make room for a saved grid: one that has grown is another size than a fresh one."""
+    """Resize the grid to that of the state, which may have grown."""
     saved = state.get(f"{prefix}grid")
     if isinstance(saved, Tensor) and saved.shape[:2] == field.grid.shape[:2]:
         field.grid.data = field.grid.new_zeros(saved.shape)

@@ -1,4 +1,4 @@
-"""Rays through a field's box at equal steps; colour only where it counts."""
+"""Fixed-step sampling in a field's box; only samples with enough weight get a colour."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,12 +21,12 @@ from xplanes.streams import TrainingState
 
 @dataclass(frozen=True)
 class FixedStepRendering(Rendering):
-    """What rays see, and the samples that had a colour.
+    """A rendering with the colours of individual samples.
 
     Attributes:
-        colours: Colour of each of them. [M, 3]
-        weights: Share of its ray's light that each sends, without gradient. [M]
-        ray: Ray of each. [M]
+        colours: Colour of each sample that has one. [M, 3]
+        weights: Compositing weight of each of these samples, without gradient. [M]
+        ray: Ray of each of these samples. [M]
     """
 
     colours: Tensor
@@ -35,14 +35,14 @@ class FixedStepRendering(Rendering):
 
 
 class FixedStepRenderer(RayRenderer):
-    """Samples at equal distances, first where a ray enters the field's box.
+    """Places samples at equal distances along a ray, from where it enters the field's box.
 
-    Samples whose opacity, and then whose weight, does not exceed a threshold get no colour.
+    Samples with an opacity or weight up to a threshold are dropped and get no colour.
 
     Args:
-        field: Whose ``bounds`` and ``cell`` count; takes geometry and colour in two stages.
-        near: Distance at which samples begin at the earliest, in the field's frame.
-        far: Distance at which they end at the latest.
+        field: Field with ``bounds``, ``cell``, ``geometry`` and ``colour``.
+        near: Least distance of samples from the ray's origin, in the field's frame.
+        far: Largest distance of samples.
         step: Distance between samples, in cells.
         threshold: Opacity and weight up to which a sample is dropped.
 
@@ -76,7 +76,7 @@ class FixedStepRenderer(RayRenderer):
         density, features = field.geometry(samples.points, times[samples.ray])
         depth = density * step
         with torch.no_grad():
-            # A sample's weight depends on those in front of it, faint ones left out.
+            # Weights are computed without the samples whose opacity is below the threshold.
             clear = -torch.expm1(-depth) <= self.threshold
             depth_kept = torch.where(clear, 0, depth)
             nothing = torch.zeros_like(samples.points)
@@ -105,7 +105,7 @@ class FixedStepRenderer(RayRenderer):
         return ((points >= low) & (points <= high)).all(dim=1)
 
     def ends(self, origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
-        """Distances, from near to far, between which rays are in a box. [R, 3] -> [R], [R]"""
+        """Distances at which rays enter and leave a box, in [near, far]. [R, 3] -> [R], [R]"""
         slopes = torch.where(directions == 0, 1e-6, directions)
         first, second = (box[0] - origins) / slopes, (box[1] - origins) / slopes
         enter = torch.minimum(first, second).amax(dim=1).clamp(self.near, self.far)
@@ -160,7 +160,7 @@ class FixedStepSettings(SamplerSettings):
     def require(self, field: RadianceField | type[RadianceField]) -> None:
         if not hasattr(field, "cell"):
             raise ConfigError(
-                f"model.sampler.name={self.name}: needs a field of cells, as TiNeuVox's; set "
+                f"model.sampler.name={self.name}: needs a feature grid, as TiNeuVox has; set "
                 "model/sampler=occupancy or proposal"
             )
 
@@ -184,10 +184,10 @@ class FixedStepSettings(SamplerSettings):
 
 
 class FixedStepSampler(Sampler):
-    """Nothing to update: samples lie where the box and the cells' size put them, without jitter.
+    """Places samples at fixed steps, without jitter; it has no state to update.
 
     Args:
-        renderer: Places them.
+        renderer: The renderer.
     """
 
     def __init__(self, renderer: FixedStepRenderer) -> None:

@@ -21,7 +21,7 @@ from xplanes.settings import Count, Positive, Range, Settings, Steps, Weight
 from xplanes.streams import Stream, TrainingState, initial_values
 
 LEAST_LIGHT = 1e-6
-"""Shares of light closer than this to 0 and 1 are taken as that close."""
+"""Transmittance is clamped to [LEAST_LIGHT, 1 - LEAST_LIGHT] in the entropy."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,9 +109,9 @@ class TiNeuVoxSettings(ModelSettings):
 
 
 class TiNeuVoxModel(Model):
-    """The colour's error, rays that are stopped or not, and samples that show their ray's colour.
+    """Colour error, entropy of the opacity, and colour error of individual samples.
 
-    The optimiser starts afresh whenever the grid grows, learning rates included.
+    The optimiser's state and the decay of learning rates are reset whenever the grid grows.
 
     Args:
         settings: Learning rates, growth and weights.
@@ -157,7 +157,7 @@ class TiNeuVoxModel(Model):
         return 0.1 ** ((step - begun) / self.settings.decay_steps)
 
     def voxels(self, step: int) -> int:
-        """Number of cells in a step."""
+        """Number of cells at a step."""
         to_come = sum(at > step for at in self.settings.grow_at)
         return self._field.resolution**3 // 2**to_come
 
@@ -190,7 +190,7 @@ class TiNeuVoxModel(Model):
 
 
 def frusta_box(views: Views, near: float, far: float, margin: float) -> Tensor:
-    """The box of all that cameras see between two distances, ``margin`` times as large. [2, 3]"""
+    """Bounding box of camera frusta between two distances, enlarged by ``margin``. [2, 3]"""
     low, high = torch.full((3,), torch.inf), torch.full((3,), -torch.inf)
     for index in range(len(views)):
         origins, directions = views.image_rays(index)
@@ -202,7 +202,7 @@ def frusta_box(views: Views, near: float, far: float, margin: float) -> Tensor:
 
 
 def light_entropy(opacity: Tensor) -> Tensor:
-    """Entropy of whether a ray is stopped or passes, in nats, mean over rays. [R] -> []
+    """Binary entropy of the opacity in nats, mean over rays. [R] -> []
 
     Source: TiNeuVox, released code; DirectVoxGO.
     """
@@ -211,12 +211,12 @@ def light_entropy(opacity: Tensor) -> Tensor:
 
 
 def sample_colour_error(colours: Tensor, target: Tensor, weights: Tensor, ray: Tensor) -> Tensor:
-    """Squared error of each sample's own colour, weighted and summed along rays, mean over rays.
+    """Squared colour error of individual samples, weighted and summed along rays, mean over rays.
 
     Args:
         colours: Colour of each sample. [M, 3]
-        target: True colour of each ray. [R, 3]
-        weights: Share of its ray's light that each sample sends, without gradient. [M]
+        target: Ground-truth colour of each ray. [R, 3]
+        weights: Compositing weight of each sample, without gradient. [M]
         ray: Ray of each sample. [M]
 
     Source: TiNeuVox, released code; DirectVoxGO.
@@ -226,14 +226,14 @@ def sample_colour_error(colours: Tensor, target: Tensor, weights: Tensor, ray: T
 
 
 class MaskedAdam(torch.optim.Optimizer):
-    """Adam whose groups may be ``masked``: entries with a gradient of zero keep value and moments.
+    """Adam with ``masked`` groups, where entries with zero gradient keep value and moments.
 
-    The bias corrections are taken into the step, so ``eps`` counts against the uncorrected root.
+    Bias corrections are part of the step size, so ``eps`` is added to the uncorrected root.
 
     Args:
-        groups: Parameter groups with ``params``, ``lr`` and, if they are, ``masked``.
-        betas: Decay of the two moments.
-        eps: Keeps the step finite.
+        groups: Parameter groups with ``params``, ``lr`` and optionally ``masked``.
+        betas: Decay rates of the two moments.
+        eps: Added to the denominator.
 
     Source: TiNeuVox and DirectVoxGO, released code.
     """
@@ -276,7 +276,7 @@ class MaskedAdam(torch.optim.Optimizer):
             parameter.addcdiv_(mean, square.sqrt().add_(group["eps"]), value=-size * group["lr"])
             return
         if parameter.device.type != "cpu":
-            # A list of what is reached would be waited for.
+            # ``nonzero`` would synchronise with the GPU.
             still = gradient == 0
             new_mean = torch.where(still, mean, mean.lerp(gradient, 1 - first))
             new_square = (square * second).addcmul_(gradient, gradient, value=1 - second)

@@ -1,4 +1,4 @@
-"""Procedural scenes that move, rendered exactly by ray casting."""
+"""Procedural dynamic scenes, rendered by exact ray casting."""
 
 from xplanes.synthetic.demo.assembly import Assembly, Joint, Part
 from xplanes.synthetic.demo.posed import Hits, Posed, PosedPart

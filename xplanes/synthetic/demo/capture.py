@@ -42,7 +42,7 @@ def even_times(count: int) -> list[float]:
 def held_out_times(count: int, draw: random.Random) -> list[float]:
     """Stratified random times in [0, 1].
 
-    The first is 0, because readers of D-NeRF's format expect every split to begin there.
+    The first is 0, because readers of D-NeRF's format expect every split to begin at time 0.
     """
     return [0.0, *((i + draw.random()) / count for i in range(1, count))]
 
@@ -143,9 +143,9 @@ class Rig:
 
 @dataclass(frozen=True)
 class Phone(Rig):
-    """One camera that is carried along an arc while time runs, up and down a little.
+    """One hand-held camera that moves along an arc over time, slightly up and down.
 
-    Validation and test cameras stand above where it was a little earlier or later.
+    Validation and test cameras are above its positions slightly earlier or later.
     """
 
     def _stations(
@@ -170,9 +170,9 @@ class Phone(Rig):
 
 @dataclass(frozen=True)
 class Array(Rig):
-    """Fixed cameras that all take a picture at each timestep; the last one may lack some.
+    """Fixed cameras that all record each timestep; the last timestep may lack some.
 
-    Validation and test views are of the same timesteps, as those of a held-out camera.
+    Validation and test views have the same times as the training views.
     """
 
     fixed: int = 8  # type: ignore[assignment]

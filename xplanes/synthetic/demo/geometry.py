@@ -1,4 +1,4 @@
-"""The torus, hit by rays where a quartic polynomial first changes its sign."""
+"""Solids and surfaces of procedural scenes, with exact ray intersections."""
 
 import math
 from abc import ABC, abstractmethod
@@ -382,7 +382,7 @@ class Bricks(Surface):
 
 @dataclass(frozen=True)
 class Unlit(Surface):
-    """A surface that no light shades."""
+    """A surface without shading."""
 
     base: Surface
     lit: ClassVar[bool] = False

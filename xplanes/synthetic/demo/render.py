@@ -50,10 +50,10 @@ def image_samples(
     samples: int,
     angle_x: float,
 ) -> Tensor:
-    """Mean over the rays of each pixel of what they see.
+    """Mean of the values of all rays of each pixel.
 
     Args:
-        see: From origins and unit directions [N, 3] to [N, 4].
+        see: Function from origins and unit directions [N, 3] to values [N, 4].
         camera_to_world: Camera-to-world matrix. [4, 4]
         resolution: Height and width in pixels.
         samples: Rays per pixel and axis.

@@ -1,4 +1,4 @@
-"""What stands around and behind a thing: pictures without alpha, and masks of the thing."""
+"""Surroundings of an object: opaque images, and masks of the object."""
 
 from dataclasses import dataclass, replace
 
@@ -12,18 +12,18 @@ from xplanes.synthetic.demo.geometry import Colour
 from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, image_samples
 
 CLOUDS = 0.06
-"""How far the sky's colour varies."""
+"""Amplitude of the variation of the sky's colour."""
 
 
 @dataclass(frozen=True)
 class World:
-    """A world around a thing, all of it static.
+    """Static surroundings of an object.
 
     Attributes:
-        parts: What stands there, the ground included.
-        zenith: Colour of the sky straight above.
-        horizon: Its colour at the horizon, which far things fade to.
-        haze: Distance at which things have faded by 63%.
+        parts: Parts of the surroundings, including the ground.
+        zenith: Colour of the sky at the zenith.
+        horizon: Colour of the sky at the horizon; distant surfaces fade to it.
+        haze: Distance at which surfaces have faded by 63%.
     """
 
     parts: tuple[Part, ...]
@@ -48,10 +48,10 @@ class World:
         samples: int = 2,
         angle_x: float = CAMERA_ANGLE_X,
     ) -> tuple[NDArray, NDArray]:
-        """Render one picture of a thing in this world.
+        """Render one image of an object with these surroundings.
 
         Args:
-            thing: The thing.
+            thing: The object.
             time: From 0 to 1.
             camera_to_world: Camera-to-world matrix. [4, 4]
             resolution: Height and width in pixels.
@@ -59,8 +59,8 @@ class World:
             angle_x: Field of view in radians.
 
         Returns:
-            Colours, uint8 [resolution, resolution, 3], and the share of each pixel that shows the
-            thing, uint8 [resolution, resolution].
+            Colours, uint8 [resolution, resolution, 3], and the share of each pixel that the object
+            covers, uint8 [resolution, resolution].
         """
         whole = replace(thing, parts=(*thing.parts, *self.parts)).pose(time)
 

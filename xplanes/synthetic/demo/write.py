@@ -38,7 +38,7 @@ VERSION = 2
 """Version of the renderer; increase it whenever the images of a scene change."""
 
 SUITE_VERSION = 2
-"""The same for the scenes of the suite."""
+"""Version of the scenes of the suite; increase it whenever their images change."""
 
 RECORD = "demo.json"
 """File that describes the content of a scene folder; written last."""
@@ -125,8 +125,8 @@ def ensure_suite_scene(
     """Render a scene of the suite unless its folder exists already.
 
     Arguments, folder and errors are those of `ensure_demo_scene`. There is no fixed-view video.
-    Beside the opaque images of an object with surroundings lie masks of it, in ``masks``, which
-    nothing but scores may read.
+    Objects with surroundings have opaque images, and masks of the object in ``masks``. Only scores
+    may use these masks, unless ``mask_use`` says otherwise.
     """
     counts = {"train": train_views, "val": val_views, "test": test_views}
     _require_some(resolution, counts)
@@ -378,7 +378,7 @@ class SuiteSettings(ProceduralSettings):
 
 
 def cut_out(views: Views, foreground: Tensor) -> Views:
-    """Opaque views with the share of each pixel that shows the object as alpha. uint8 [V, H, W]"""
+    """Opaque views with a foreground mask as their alpha. uint8 [V, H, W]"""
     images = views.in_memory().clone()
     share = foreground[..., None] / 255
     images[..., :3] = (images[..., :3].float() * share).round().to(torch.uint8)

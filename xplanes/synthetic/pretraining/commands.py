@@ -8,7 +8,7 @@ say = partial(print, flush=True)
 
 
 def add_commands(commands: "argparse._SubParsersAction") -> None:
-    """Add both to the command line; heavy modules are imported when one is run."""
+    """Add both commands to the command line; heavy modules are imported when they run."""
     _add_pretrain(commands)
     _add_score(commands)
 

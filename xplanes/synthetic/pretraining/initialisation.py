@@ -14,7 +14,7 @@ SHARPNESS = 1.2
 """Scale of the identity that initialises queries and keys of attention to the image."""
 
 SELF_SHARPNESS = 0.8
-"""The same for attention among the planes' tokens."""
+"""Scale of this identity for attention among the planes' tokens."""
 
 SLOWEST, FASTEST = 0.8, 16.0
 """Range of the frequencies of the position embedding, in radians per unit length."""
@@ -122,7 +122,7 @@ def grow_model(earlier: OpenLRM, config: LRMConfig) -> OpenLRM:
         config: Sizes of the new model.
 
     Raises:
-        ValueError: If they differ in more.
+        ValueError: If the configurations differ in anything else.
     """
     for each in fields(config):
         before, now = getattr(earlier.config, each.name), getattr(config, each.name)

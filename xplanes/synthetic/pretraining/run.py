@@ -95,7 +95,7 @@ CHECKPOINT = "last.ckpt"
 
 
 class Steps(IterableDataset):
-    """Batches from the module's step on.
+    """Batches from the module's current step on.
 
     Args:
         batches: Draws the batch of a step.
@@ -211,7 +211,7 @@ def _grown(init_from: str, sizes: LRMConfig) -> OpenLRM:
     try:
         earlier = load(read_json(weights.with_suffix(".json")), weights)
         if not isinstance(earlier, OpenLRM):
-            raise ValueError(f"they are of {earlier.config.architecture}")
+            raise ValueError(f"their architecture is {earlier.config.architecture}")
         return grow_model(earlier, sizes).requires_grad_(True)
     except (OSError, ValueError, RuntimeError) as problem:
         raise ConfigError(
@@ -227,8 +227,8 @@ def _settle(run: Path, plain: dict) -> None:
             before = read_json(path)
         except ValueError as problem:
             raise ConfigError(
-                f"{path} is damaged: delete it if the settings are those that the run began with, "
-                "or name another run"
+                f"{path} is damaged: delete it if the settings are still the same, or choose "
+                "another run"
             ) from problem
         for key in ("seed", "model", "pool"):
             if before.get(key) != plain[key]:

@@ -9,7 +9,7 @@ from xplanes.errors import ConfigError
 from xplanes.settings import Count, Location, Positive, Settings, Share, Steps, Weight
 
 NARROWEST = 12
-"""Channels of a head at least: half of them hold a sine and a cosine along each of three axes."""
+"""Least channels per head: half of them contain a sine and a cosine for each of three axes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +27,7 @@ class SizeSettings(Settings):
     low_resolution: Count  # Tokens along each side of a plane; a plane has twice as many texels.
     channels: Count  # Channels of each plane.
     camera_width: Count  # Channels of the camera embedding.
-    distance: Positive  # From the camera to the centre of the box [-1, 1]^3.
+    distance: Positive  # Distance of the camera from the centre of the box [-1, 1]^3.
     density_scale: Positive  # Factor on the density: 1 / (length of a step).
 
     def check(self) -> None:
@@ -40,7 +40,7 @@ class SizeSettings(Settings):
         if self.width // self.heads < NARROWEST:
             raise ConfigError(
                 f"width={self.width}: must be at least {NARROWEST * self.heads}, {NARROWEST} for "
-                f"each of model.heads={self.heads}, which hold sines and cosines of a place"
+                f"each of model.heads={self.heads}, for sines and cosines of positions"
             )
 
 
@@ -54,7 +54,7 @@ class PoolSettings(Settings):
 
     def check(self) -> None:
         if self.views < 2:
-            raise ConfigError(f"views={self.views}: must be at least 2, one of them to score")
+            raise ConfigError(f"views={self.views}: must be at least 2, one of them for scores")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -78,7 +78,7 @@ def distance(kind, a, b, c, x, y, z):
 
 @njit(**COMPILE)
 def hit(kind, a, b, c, ox, oy, oz, dx, dy, dz):
-    """Distance to where a ray from outside enters a solid, in its own coordinates."""
+    """Distance at which a ray from outside enters a solid, in its own coordinates."""
     near, far = INF, -INF
     if kind == 0:
         n0, f0 = slab(ox, dx, a)

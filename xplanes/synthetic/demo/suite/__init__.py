@@ -26,9 +26,9 @@ class SuiteScene:
 
     Attributes:
         build: Builds the assembly with the colours of a variation.
-        rig: Its cameras and times.
-        world: Builds what is around the assembly, with the colours of a variation: the pictures
-            are opaque then. None for pictures of the assembly alone, with alpha.
+        rig: Cameras and times.
+        world: Builds the surroundings with the colours of a variation, for opaque images; None for
+            images of the assembly alone, with alpha.
     """
 
     build: Callable[[Variation], Assembly]
@@ -106,7 +106,7 @@ def suite_scene(name: str) -> SuiteScene:
     """The scene called ``name``.
 
     Raises:
-        SceneError: No scene has that name; the message lists those there are.
+        SceneError: If no scene has that name; the message lists all names.
     """
     if name in SUITE_SCENES:
         return SUITE_SCENES[name]

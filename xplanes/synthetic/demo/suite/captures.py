@@ -1,4 +1,4 @@
-"""Things in a world without end, as a phone or a rig of cameras captures them: opaque pictures."""
+"""Objects in unbounded surroundings, captured by a phone or a camera rig in opaque images."""
 
 from xplanes.synthetic.demo.assembly import Assembly, Part, Vector
 from xplanes.synthetic.demo.geometry import (
@@ -19,11 +19,11 @@ from xplanes.synthetic.demo.suite.pieces import ball, rod
 from xplanes.synthetic.demo.world import World
 
 TIMESTEPS = 11
-"""Timesteps at which the lowest point of a thing is looked for."""
+"""Number of timesteps in the search for the lowest point of an object."""
 
 
 def _ground(thing: Assembly, surface: Surface) -> tuple[float, Part]:
-    """Height of the ground that a thing stands on, and the ground."""
+    """Height of the ground below an object, and the ground as a part."""
     lows = [thing.pose(i / (TIMESTEPS - 1)).bounds()[0][2] for i in range(TIMESTEPS)]
     height = float(min(lows)) - 0.005
     return height, Part(Box((60.0, 60.0, 0.5)), surface, position=(0, 0, height - 0.5))

@@ -101,7 +101,7 @@ def test_a_model_brings_its_initialisation_and_changes_no_other_group():
     with pytest.raises(ConfigError, match=r"^lrm=tiny with model=kplanes: .* set lrm=none"):
         Experiment.read(composed("model=kplanes", "lrm=tiny"))
     lacking = {name: node for name, node in composed().items() if name != "lrm"}
-    with pytest.raises(ConfigError, match=r"^lrm: model=six_planes chooses none; write `- /lrm"):
+    with pytest.raises(ConfigError, match=r"^lrm: model=six_planes chooses none; add `- /lrm"):
         Experiment.read(lacking)
 
 

@@ -3,7 +3,6 @@
 import hashlib
 import http.server
 import json
-import threading
 import time
 from dataclasses import replace
 
@@ -11,6 +10,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from tests.local_server import serving
 from tests.lrm.reduced import published_shapes, reduced
 from xplanes.lrm import LRMError
 from xplanes.lrm.config import parse_config, published_config
@@ -85,15 +85,9 @@ def online(monkeypatch):
 @pytest.fixture
 def hub(monkeypatch):
     """Address of a hub on this machine, and what it was asked for."""
-    for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY", "all_proxy"):
-        monkeypatch.delenv(name, raising=False)
     handler = type("Handler", (Hub,), {"requests": []})
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_address[1]}", handler
-    server.shutdown()
-    server.server_close()
+    with serving(handler, monkeypatch) as address:
+        yield address, handler
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ import http.server
 import json
 import re
 import shutil
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import pytest
 import torch
 import yaml
 
+from tests.local_server import serving
 from xplanes.cli import main
 from xplanes.errors import ConfigError
 from xplanes.tools.hub import fetch, model_card, push
@@ -111,17 +111,11 @@ def oid(content: bytes) -> str:
 @pytest.fixture
 def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, type[Hub]]]:
     """Address of a hub on this machine, and what it holds."""
-    for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY", "all_proxy"):
-        monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HF_TOKEN", "hf_of_a_test")
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
     handler = type("Handler", (Hub,), {"requests": [], "files": {}, "name": None})
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_address[1]}", handler
-    server.shutdown()
-    server.server_close()
+    with serving(handler, monkeypatch) as address:
+        yield address, handler
 
 
 def test_a_run_comes_back_from_the_hub_as_it_was_pushed(hub, trained_run: Path, tmp_path: Path):

@@ -17,9 +17,9 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
 from tests.baselines.runs import KPLANES, PROPOSAL, baseline_config
-from tests.training.runs import small_config
+from tests.training.runs import small_config, train_quietly
 from tests.training.test_surroundings import scene
-from xplanes import RadianceModule, SceneDataModule
+from xplanes import RadianceModule
 from xplanes.cli import main
 from xplanes.errors import ConfigError
 from xplanes.evaluation.render import orbit_poses
@@ -31,7 +31,6 @@ from xplanes.tools.live import LiveViewer
 from xplanes.tools.runs import TrainedRun, load_run
 from xplanes.tools.viewer import HOST, Viewer, camera_pose, check_address
 from xplanes.training.clock import TrainingClock, find_callback
-from xplanes.training.fit import Trainer
 
 pytest.importorskip("viser")
 
@@ -270,18 +269,7 @@ def fitted(name: str, folder: Path, *callbacks: Callback, steps: int = 12) -> Ra
     config, kind, overrides = FIELDS[name]
     found = RadianceModule(config(Path(), *overrides))
     found.build(scene(kind))
-    trainer = Trainer(
-        accelerator="cpu",
-        max_steps=steps,
-        callbacks=callbacks,
-        default_root_dir=folder,
-        logger=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        enable_checkpointing=False,
-        limit_val_batches=0,
-    )
-    trainer.train(found, SceneDataModule.of(scene(kind)))
+    train_quietly(found, scene(kind), folder, steps, callbacks=callbacks)
     return found
 
 

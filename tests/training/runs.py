@@ -16,6 +16,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from xplanes.config import CONF, to_plain
+from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.views import Scene
+from xplanes.training.fit import Trainer
+from xplanes.training.module import RadianceModule
 
 COMPOSE = hydra.compose
 
@@ -81,6 +85,25 @@ def changed(base: tuple[str, ...], *overrides: str) -> dict[str, Any]:
 def small_config(root: Path, *overrides: str) -> dict[str, Any]:
     """A configuration that trains in seconds, as plain builtins."""
     return changed(SMALL, f"data.root={root}", *overrides)
+
+
+def train_quietly(
+    module: RadianceModule, scene: Scene, folder: Path, steps: int, **more: Any
+) -> Trainer:
+    """A trainer that has trained a module and logged and written nothing."""
+    trainer = Trainer(
+        accelerator="cpu",
+        max_steps=steps,
+        default_root_dir=folder,
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        enable_checkpointing=False,
+        limit_val_batches=0,
+        **more,
+    )
+    trainer.train(module, SceneDataModule.of(scene))
+    return trainer
 
 
 def metrics(folder: Path) -> dict[str, Any]:

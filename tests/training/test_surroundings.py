@@ -9,14 +9,13 @@ import torch
 
 from tests.balls import ball_views, swinging
 from tests.baselines.runs import KPLANES, PROPOSAL, TINEUVOX
-from tests.training.runs import small_config
+from tests.training.runs import small_config, train_quietly
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.baselines.proposal import spaced, unspaced
 from xplanes.rendering.behind import look
 from xplanes.scenes.views import Scene
 from xplanes.training.collapse import CollapseWatch
 from xplanes.training.evaluation import affordable
-from xplanes.training.fit import Trainer
 from xplanes.training.losses import loss_terms
 from xplanes.training.scores import score_view
 
@@ -53,22 +52,6 @@ def built(kind, *overrides):
     module = RadianceModule(small_config(Path(), "model.rays.per_batch=512", *overrides))
     module.build(scene(kind))
     return module
-
-
-def fitted(module, kind, folder, steps=STEPS, checkpoint=None, **options):
-    trainer = Trainer(
-        accelerator="cpu",
-        max_steps=steps,
-        default_root_dir=folder,
-        logger=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        enable_checkpointing=False,
-        limit_val_batches=0,
-        **options,
-    )
-    trainer.train(module, SceneDataModule.of(scene(kind)), checkpoint)
-    return trainer
 
 
 def picture(module, kind="world"):
@@ -166,7 +149,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("world")
     module = built("world")
     before = picture(module)
-    trainer = fitted(module, "world", folder, 2 * STEPS, callbacks=[CollapseWatch()])
+    trainer = train_quietly(module, scene("world"), folder, 2 * STEPS, callbacks=[CollapseWatch()])
     trainer.save_checkpoint(folder / "end.ckpt")
     return module.eval(), before, folder / "end.ckpt"
 

@@ -89,7 +89,7 @@ def main() -> None:
     data = SceneDataModule.compose(f"data.scene={args.scene}", f"data.resolution={args.resolution}")
     data.setup("fit")
     scene = data.scene
-    place = Place(scene, method.model.frame(scene.splits["train"], None), torch.device("cpu"))
+    place = Place(scene, method.model.frame(scene.splits["train"]), torch.device("cpu"))
     made = reconstruct(method, method.lrm, place, method.lrm.load_model(print), StageCache(None))
     own, found = made.sequence, []
     cameras = hemisphere_cameras(args.views, random.Random("oracle"))

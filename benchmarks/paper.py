@@ -229,7 +229,7 @@ def matrices(scene: str, lrm: str) -> Iterator[Tensor]:
     data.setup("fit")
     settings = experiment.method.lrm
     assert isinstance(settings, ImageLRMSettings)
-    frame = experiment.method.model.frame(data.scene.splits["train"], None)
+    frame = experiment.method.model.frame(data.scene.splits["train"])
     place = Place(data.scene, frame, torch.device("cpu"))
     cache = StageCache(Path("data/cache"))
     model = settings.load_model(print)

@@ -182,7 +182,8 @@ def train(
     scene, views = data.scene, data.scene.splits["train"]
     if resume and record is not None and has_checkpoint(folder):
         require_same_views(folder, record.content, views)
-    frame = method.model.frame(views, settings.half_side, scene.points)
+    hints = settings.hints(scene)
+    frame = method.model.frame(views, hints)
     if record is not None:
         findings = *camera_findings(scene, frame), *opaque_findings(scene), *stray_findings(scene)
         for finding in findings:
@@ -194,7 +195,7 @@ def train(
     module = RadianceModule(method)
     found = Initialisation(method.model, frame)
     if source is not None:
-        place = Place(scene, frame, device, experiment.devices, say, settings.half_side)
+        place = Place(scene, frame, device, experiment.devices, say, hints)
         found = source.initialise(method, place)
     del source
     began = time.perf_counter() - warm_up.seconds

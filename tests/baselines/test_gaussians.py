@@ -459,7 +459,7 @@ def test_what_does_not_fit_is_refused(tmp_path, scenes):
         compose_plain("train", ["preparation.fixed_view_model=gaussians_hexplane"])
     )
     with pytest.raises(ConfigError, match=r"fixed_view_model=gaussians_hexplane: .* six_planes"):
-        rendering_method(method, ball_views(4, 0.6), None)
+        rendering_method(method, ball_views(4, 0.6))
     camera = ball_views(1, 0.6).camera(0)
     lens = Lenses.pinholes(1)
     with pytest.raises(SceneError, match="undistort the images"):

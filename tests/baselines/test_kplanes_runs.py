@@ -17,6 +17,7 @@ from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.models.initialisation import Method
 from xplanes.rendering.sampler import Site, check_range
+from xplanes.scenes.frame import CubeHints
 from xplanes.training.module import RadianceModule
 
 FAST = (*KPLANES, "model.channels=8", "model.learning_rate=0.03")
@@ -86,7 +87,7 @@ def test_settings_that_do_not_go_together_are_refused(scenes):
 def test_cameras_out_of_range_are_refused(scenes):
     settings = Method.read(baseline_config(scenes, "model=kplanes")).model
     views = ball_views(4, 0.6, distance=12.0)
-    site = Site(settings.frame(views, None), views.times, 0, "32", views=views)
+    site = Site(settings.frame(views), views.times, 0, "32", views=views)
     with pytest.raises(ConfigError, match=r"model\.sampler\.far=6\.0: the cameras stand 12 to 12"):
         check_range(site, 2.0, 6.0)
     # The sampler asks.
@@ -97,24 +98,24 @@ def test_cameras_out_of_range_are_refused(scenes):
 def test_cube_is_the_published_one_or_the_scenes(scenes):
     views = ball_views(4, 0.6)
     settings = Method.read(baseline_config(scenes, "model=kplanes")).model
-    frame = settings.frame(views, None)
+    frame = settings.frame(views)
     assert frame.scale == pytest.approx(1 / 1.3)
     assert torch.equal(frame.centre, torch.zeros(3))
-    assert replace(settings, half_side=None).frame(views, None).scale > 1
+    assert replace(settings, half_side=None).frame(views).scale > 1
 
 
 def test_a_cube_of_the_wrong_size_is_said(scenes, caplog):
     settings = Method.read(baseline_config(scenes, "model=kplanes")).model
-    settings.frame(ball_views(6, 0.6), None)
+    settings.frame(ball_views(6, 0.6))
     assert not caplog.records
-    settings.frame(ball_views(6, 3.0, distance=12.0), None)
+    settings.frame(ball_views(6, 3.0, distance=12.0))
     assert "model.half_side=1.3: the scene reaches 3." in caplog.text
 
 
 def test_two_cubes_are_refused(scenes):
     module = RadianceModule(baseline_config(scenes, "model=kplanes"))
     with pytest.raises(ConfigError, match=r"data\.half_side=1\.5 with model\.half_side=1\.3"):
-        module.build(ball_scene(), half_side=1.5)
+        module.build(ball_scene(), hints=CubeHints(1.5))
     module = RadianceModule(baseline_config(scenes, "model=kplanes", "model.half_side=null"))
-    module.build(ball_scene(), half_side=1.5)
+    module.build(ball_scene(), hints=CubeHints(1.5))
     assert module.frame.scale == pytest.approx(1 / 1.5)

@@ -8,7 +8,8 @@ from tests.baselines.runs import NEUS, OCCUPANCY, TENSOR4D, baseline_config
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.models.initialisation import Method
-from xplanes.rendering.sampler import Site, scene_cube
+from xplanes.rendering.sampler import Site
+from xplanes.scenes.frame import scene_frame
 from xplanes.streams import TrainingState
 
 
@@ -40,8 +41,8 @@ def test_density_run_learns_and_is_loaded(scenes, tmp_path):
 def model(scenes, *overrides):
     settings = Method.read(baseline_config(scenes, "model=tensor4d", *overrides)).model
     views = ball_views(4, 0.6)
-    frame = settings.frame(views, None)
-    assert frame.scale == scene_cube(views, None).scale
+    frame = settings.frame(views)
+    assert frame.scale == scene_frame(views).scale
     return settings.build(Site(frame, views.times, 0, "32"))
 
 

@@ -37,7 +37,7 @@ def test_box_holds_what_cameras_see_between_the_bounds(scenes):
 def test_learning_rates_and_cells_follow_the_published_schedule(scenes):
     settings = Method.read(baseline_config(scenes, "model=tineuvox_s")).model
     views = ball_views(4, 0.6)
-    frame, bounds = settings.frame(views, None), settings.bounds(views)
+    frame, bounds = settings.frame(views), settings.bounds(views)
     model = settings.build(Site(frame, views.times, 0, "32", bounds))
     steps = (0, 1999, 2000, 4000, 6000, 19999)
     assert [model.voxels(s) for s in steps] == [125000, 125000, 250000, 500000, 1000000, 1000000]

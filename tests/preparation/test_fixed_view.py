@@ -24,7 +24,7 @@ from xplanes.preparation.cache import StageCache
 from xplanes.preparation.fixed_view import canonical_pose, fixed_view, pick_frames, rendering_method
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.sampler import Site
-from xplanes.scenes.frame import Frame, scene_frame
+from xplanes.scenes.frame import CubeHints, Frame, scene_frame
 from xplanes.scenes.views import Scene
 from xplanes.training.module import TrainingError
 
@@ -66,7 +66,9 @@ def video_of(method, scene, folder, size=24):
 
 def test_the_field_that_renders_has_its_models_default_settings(tmp_path: Path):
     changed = ("model=nine_planes", "model.sampler.samples=16", "model.precision=bf16")
-    rendering = rendering_method(settings(tmp_path, *changed, "seed=3"), ball_views(6, 0.6), 0.9)
+    rendering = rendering_method(
+        settings(tmp_path, *changed, "seed=3"), ball_views(6, 0.6), CubeHints(0.9)
+    )
     default = default_settings().model
     # Images for a model of few pixels need no more samples than training.
     sampler = replace(default.sampler, samples=128, render_samples=128)
@@ -102,7 +104,7 @@ def test_it_leaves_the_run_as_deterministic_as_it_was(tmp_path: Path, small_fiel
 def test_kplanes_render_as_published(tmp_path: Path):
     own = settings(tmp_path, "preparation.fixed_view_model=kplanes")
     published = default_settings("model=kplanes").model
-    found = rendering_method(own, ball_views(6, 0.6), None).model
+    found = rendering_method(own, ball_views(6, 0.6)).model
     assert found == replace(published, precision=own.model.precision)
     assert not published.rays.skip_background
 
@@ -129,12 +131,13 @@ PLACES = {
 @pytest.mark.parametrize("place", PLACES)
 def test_published_bounds_give_way_where_they_do_not_fit(tmp_path: Path, place):
     moved, half_side = PLACES[place]
+    hints = CubeHints(half_side)
     views = elsewhere(**moved)
-    cube = scene_frame(views, half_side)
+    cube = scene_frame(views, hints)
     for name in ("kplanes", "kplanes_explicit", "tineuvox_s"):
         method = settings(tmp_path, f"preparation.fixed_view_model={name}")
-        model = rendering_method(method, views, half_side).model
-        frame, bounds = model.frame(views, half_side), model.bounds(views)
+        model = rendering_method(method, views, hints).model
+        frame, bounds = model.frame(views, hints), model.bounds(views)
         site = Site(frame, views.times, 0, "32", views=views, bounds=bounds)
         if name == "tineuvox_s":
             # Its box is that of what the cameras see, which holds the scene from side to side.

@@ -9,7 +9,7 @@ import torch
 from tests.balls import ball_views, inside_ball, swinging
 from xplanes.errors import SceneError
 from xplanes.scenes.cameras import look_at, orbit
-from xplanes.scenes.frame import Frame, _reach, cube_frame, optical_centre, scene_frame
+from xplanes.scenes.frame import CubeHints, Frame, _reach, cube_frame, optical_centre, scene_frame
 from xplanes.scenes.lenses import Lenses, LensModel
 from xplanes.scenes.views import Intrinsics, Views
 
@@ -181,7 +181,7 @@ def ring(count=24, seed=0):
 
 
 def test_opaque_scenes_take_the_cube_of_the_points_in_the_middle():
-    frame = scene_frame(ring(), points=points_of())
+    frame = scene_frame(ring(), CubeHints(points=points_of()))
     assert frame.source == "points"
     # 96% of evenly spread points, with 15% of room.
     assert 1 / frame.scale == pytest.approx(1.15 * 0.96 * 0.5, rel=0.05)
@@ -192,19 +192,38 @@ def test_opaque_scenes_take_the_cube_of_the_points_in_the_middle():
     views, shift = ring(), torch.tensor([50.0, -20.0, 5.0])
     poses = views.camera_to_world.clone()
     poses[:, :3, 3] = 10 * poses[:, :3, 3] + shift
-    moved = scene_frame(replace(views, camera_to_world=poses), points=10 * points_of() + shift)
+    moved = scene_frame(
+        replace(views, camera_to_world=poses), CubeHints(points=10 * points_of() + shift)
+    )
     assert moved.scale == pytest.approx(frame.scale / 10, rel=1e-3)
 
 
 def test_a_half_side_that_is_given_keeps_its_size_around_the_points():
-    frame = scene_frame(ring(), 2.5, points_of())
+    frame = scene_frame(ring(), CubeHints(2.5, points=points_of()))
     assert (frame.scale, frame.source) == (0.4, "data.half_side")
     assert torch.allclose(frame.centre, CLUSTER, atol=0.04)
 
 
+def test_a_centre_that_is_given_holds_for_every_size():
+    views, centre = ring(), [0.1, -0.2, 0.05]
+    cases = {
+        "data.centre and data.half_side": CubeHints(2.5, centre),
+        "data.centre and points": CubeHints(centre=centre, points=points_of()),
+        "data.centre and cameras": CubeHints(centre=centre),
+    }
+    for source, hints in cases.items():
+        frame = scene_frame(views, hints)
+        assert frame.source == source
+        assert frame.centre.tolist() == pytest.approx(centre)
+    # Around another centre the cube must reach farther to hold the same points.
+    around = scene_frame(views, cases["data.centre and points"])
+    inside = around.points(points_of()[:400]).abs().amax(dim=1) <= 1
+    assert inside.float().mean() > 0.95
+
+
 def test_silhouettes_come_before_points():
     views = ball_views(24, 0.5, poses=ring().camera_to_world, size=20)
-    frame = scene_frame(views, points=points_of())
+    frame = scene_frame(views, CubeHints(points=points_of()))
     assert frame.source == "cameras and silhouettes"
     assert frame.scale == scene_frame(views).scale
 
@@ -221,6 +240,6 @@ def test_silhouettes_come_before_points():
     ],
 )
 def test_points_that_tell_nothing_leave_the_cameras_cube(points):
-    frame = scene_frame(ring(), points=points)
+    frame = scene_frame(ring(), CubeHints(points=points))
     assert frame.source == "cameras"
     assert frame.scale == scene_frame(ring()).scale

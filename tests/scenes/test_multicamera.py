@@ -325,6 +325,8 @@ def test_settings_of_the_command_line(videos: Path) -> None:
     for frames in ([0, 1], [3, 2, 1], [-1, 2, 1], [0, 2, 0]):
         with pytest.raises(ConfigError, match="frames="):
             replace(settings, frames=frames)
+    with pytest.raises(ConfigError, match=r"centre=\[1.0, 2.0\]: must be three"):
+        replace(settings, centre=[1, 2])
 
 
 def test_a_camera_is_held_out_by_default(videos: Path, tmp_path: Path, caplog) -> None:

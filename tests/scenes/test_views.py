@@ -51,7 +51,8 @@ def test_a_video_that_is_not_there_is_refused(config, tmp_path):
     shutil.copytree(folder, tmp_path / folder.name)
     (tmp_path / folder.name / "transforms_video.json").unlink()
     shared = {name: getattr(config, name) for name in ("resolution", "views", "static")}
-    values = shared | {"eval_split": "test", "eval_views": None, "half_side": None, "cache": None}
+    values = shared | dict.fromkeys(("eval_views", "half_side", "centre", "cache"))
+    values |= {"eval_split": "test"}
     values |= {"name": "dnerf", "root": str(tmp_path), "scene": folder.name}
     with pytest.raises(SceneError, match=r"no video of a fixed camera.*set it to false"):
         BlenderSettings(**values, train_on_video=True).read()

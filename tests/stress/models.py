@@ -11,6 +11,7 @@ from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX
 from xplanes.config import compose_plain
 from xplanes.experiment import Experiment
 from xplanes.run import run
+from xplanes.scenes.frame import CubeHints
 from xplanes.training.module import RadianceModule
 
 XPLANES = (
@@ -101,5 +102,5 @@ def built(config: dict[str, Any]) -> RadianceModule:
     experiment = Experiment.read(config)
     torch.manual_seed(0)
     module = RadianceModule(config)
-    module.build(experiment.data.read(), half_side=experiment.data.half_side)
+    module.build(experiment.data.read(), hints=CubeHints(experiment.data.half_side))
     return module

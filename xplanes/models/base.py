@@ -11,9 +11,9 @@ from torch import Tensor
 
 from xplanes.fields.base import Representation
 from xplanes.rendering.base import Rendering
-from xplanes.rendering.sampler import Group, SamplerSettings, Site, scene_cube
+from xplanes.rendering.sampler import Group, SamplerSettings, Site
 from xplanes.scenes.batches import Batch, RaySettings
-from xplanes.scenes.frame import Frame
+from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame, scene_frame
 from xplanes.scenes.views import Views
 from xplanes.settings import Settings, Weight
 from xplanes.streams import TrainingState
@@ -172,30 +172,26 @@ class ModelSettings(Settings, ABC):
         texels = getattr(self, "resolution", None)
         return texels if isinstance(texels, int) else None
 
-    def frame(self, views: Views, half_side: float | None, points: Tensor | None = None) -> Frame:
+    def frame(self, views: Views, hints: CubeHints = NO_HINTS) -> Frame:
         """The field's frame: the scene's cube, unless the model defines another.
 
         Args:
             views: Training views.
-            half_side: Half the side of the scene's cube in world units; estimated when None.
-            points: Surface points in the world, if known. [N, 3]
+            hints: What is known of the scene's cube.
 
         Raises:
             SceneError: If the cameras see no common volume.
         """
-        return scene_cube(views, half_side, points)
+        return scene_frame(views, hints)
 
-    def for_scene(
-        self, views: Views, half_side: float | None, points: Tensor | None = None
-    ) -> "ModelSettings":
+    def for_scene(self, views: Views, hints: CubeHints = NO_HINTS) -> "ModelSettings":
         """The settings with cube, near and far from the scene, where published ones do not fit it.
 
         Unchanged by default, for models whose field and sampler take them from the scene.
 
         Args:
             views: Training views.
-            half_side: As for `frame`; if given, it also replaces a published cube that fits.
-            points: As for `frame`.
+            hints: As for `frame`; a given cube also replaces a published one that fits.
         """
         return self
 

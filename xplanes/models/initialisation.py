@@ -12,7 +12,7 @@ from xplanes.components import build
 from xplanes.config import CONF
 from xplanes.errors import ConfigError
 from xplanes.models.base import InitialValues, LossTerm, ModelSettings
-from xplanes.scenes.frame import Frame
+from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame
 from xplanes.scenes.views import Scene
 from xplanes.settings import Count, Location, Positive, Range, Settings
 
@@ -72,7 +72,7 @@ class Place:
         device: Device of the computation.
         devices: Processes that share the run.
         say: Prints a line before a slow stage.
-        half_side: Half the side of the scene's cube, if the user has set it.
+        hints: What is known of the scene's cube.
     """
 
     scene: Scene
@@ -80,7 +80,7 @@ class Place:
     device: torch.device
     devices: int = 1
     say: Callable[[str], None] = print
-    half_side: float | None = None
+    hints: CubeHints = NO_HINTS
 
 
 class Initialiser(ABC):

@@ -21,7 +21,7 @@ from xplanes.models.initialisation import Method, Place, PreparationSettings
 from xplanes.preparation.cache import StageCache
 from xplanes.rendering.base import RayRenderer
 from xplanes.scenes.cameras import PosedCamera, camera_around
-from xplanes.scenes.frame import Frame, frame_content
+from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame, frame_content
 from xplanes.scenes.views import Intrinsics, Views
 from xplanes.training.fit import fit_quietly
 from xplanes.training.module import RadianceModule
@@ -33,9 +33,7 @@ OFF_CENTRE = 0.02
 """Largest offset of the principal point from the image centre, as a share of the width."""
 
 
-def rendering_method(
-    method: Method, views: Views, half_side: float | None, points: Tensor | None = None
-) -> Method:
+def rendering_method(method: Method, views: Views, hints: CubeHints = NO_HINTS) -> Method:
     """Settings of the field that renders the fixed-view video: the defaults of its model.
 
     The run's own model is not used, because ablations of it would also change the video. Images are
@@ -44,8 +42,7 @@ def rendering_method(
     Args:
         method: The run's settings.
         views: Training views; the model's published cube, near and far stay if they fit these.
-        half_side: Half the side of the scene's cube in world units; estimated when None.
-        points: Surface points in the world, if known. [N, 3]
+        hints: What is known of the scene's cube.
     """
     name = method.preparation.fixed_view_model
     found = Method.read(compose_plain("train", [f"model={name}", "lrm=none"]))
@@ -54,7 +51,7 @@ def rendering_method(
             f"preparation.fixed_view_model={name}: its renderer takes no single rays; choose a "
             "model with a radiance field, such as six_planes"
         )
-    model = found.model.for_scene(views, half_side, points)
+    model = found.model.for_scene(views, hints)
     model = replace(model, sampler=model.sampler.for_video(), precision=method.model.precision)
     return replace(found, seed=method.seed, model=model)
 
@@ -223,8 +220,8 @@ def _rendered(
     pose = canonical_pose(train, frame, view, azimuth=options.azimuth, elevation=options.elevation)
     side = min(size, max(train.height, train.width))
     focal = view.focal * side
-    rendering = rendering_method(method, train, place.half_side, scene.points)
-    own_frame = rendering.model.frame(train, place.half_side, scene.points)
+    rendering = rendering_method(method, train, place.hints)
+    own_frame = rendering.model.frame(train, place.hints)
     # Samplers may have a fixed near bound. The LRM's camera is closer than the training cameras, so
     # its ray origins are moved back.
     away = (train.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1).mean()

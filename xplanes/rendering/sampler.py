@@ -13,7 +13,7 @@ from xplanes.errors import ConfigError, SceneError
 from xplanes.fields.base import RadianceField, Representation
 from xplanes.rendering.base import Renderer, Rendering
 from xplanes.scenes.batches import Batch
-from xplanes.scenes.frame import Frame, cube_frame, scene_frame
+from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame, cube_frame, scene_frame
 from xplanes.scenes.views import Views
 from xplanes.settings import Settings
 from xplanes.streams import TrainingState
@@ -248,29 +248,25 @@ class SamplerSettings(Settings, ABC):
         return self
 
 
-def scene_cube(views: Views, half_side: float | None, points: Tensor | None = None) -> Frame:
-    """The scene's cube, see `scene_frame`; ``half_side`` in world units, estimated when None."""
-    return scene_frame(views, half_side, points)
-
-
-def origin_cube(half_side: float, views: Views, given: float | None = None) -> Frame:
+def origin_cube(half_side: float, views: Views, hints: CubeHints = NO_HINTS) -> Frame:
     """A cube around the world's origin; warns if the scene seems to have another size.
 
     Args:
         half_side: Half the side of the cube, in world units.
         views: Training views.
-        given: ``data.half_side``, which must be None.
+        hints: What is known of the scene's cube; the user must not have set any of it.
 
     Raises:
-        ConfigError: If both are given.
+        ConfigError: If the user has set the scene's cube as well.
     """
-    if given is not None:
-        raise ConfigError(
-            f"data.half_side={given} with model.half_side={half_side}: two cubes; set "
-            "model.half_side=null to use data.half_side, or leave data.half_side out"
-        )
+    for name in ("half_side", "centre"):
+        if (given := getattr(hints, name)) is not None:
+            raise ConfigError(
+                f"data.{name}={given} with model.half_side={half_side}: two cubes; set "
+                f"model.half_side=null to use data.{name}, or leave data.{name} out"
+            )
     try:
-        scene = scene_frame(views, None)
+        scene = scene_frame(views)
     except SceneError:
         return cube_frame(half_side, torch.zeros(3), "model.half_side")
     if not fits_origin_cube(half_side, scene):

@@ -73,6 +73,7 @@ class ColmapSettings(CaptureSettings):
         return not others and len(models_inside(folder)) == 1
 
     def check(self) -> None:
+        super().check()
         if self.time_pattern is None:
             return
         if self.times is not None:

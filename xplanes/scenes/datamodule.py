@@ -230,7 +230,7 @@ class SceneDataModule(LightningDataModule):
         if rank not in self._batches:
             views = self.scene.splits["train"]
             frame = getattr(module, "frame", None)
-            frame = frame or scene_frame(views, self.settings.half_side, self.scene.points)
+            frame = frame or scene_frame(views, self.settings.hints(self.scene))
             settings = getattr(module, "ray_settings", UNIFORM)
             self._batches[rank] = settings.batches(views, frame, seed=self.seed, rank=rank)
         return self._batches[rank]
@@ -370,6 +370,7 @@ class _GivenScene(SceneSettings):
             eval_split=None,
             eval_views=None,
             half_side=None,
+            centre=None,
             cache=None,
         )
 

@@ -1,6 +1,7 @@
 """The field's frame: the map from the world into the cube [-1, 1]^3."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,6 +29,29 @@ LEAST_POINTS, MOST_POINTS, MOST_CAMERAS = 32, 20_000, 64
 
 CONVERGENCE = 0.02
 """Least eigenvalue for which optical axes meet in a point, rather than being nearly parallel."""
+
+
+@dataclass(frozen=True)
+class CubeHints:
+    """What is known of a scene's cube apart from its views.
+
+    Attributes:
+        half_side: Half its side in world units; estimated when None.
+        centre: Its centre in world coordinates; estimated when None. [3]
+        points: World points on surfaces, if known. [N, 3]
+    """
+
+    half_side: float | None = None
+    centre: Sequence[float] | None = None
+    points: Tensor | None = None
+
+    @property
+    def is_given(self) -> bool:
+        """Whether the user has set a part of the cube."""
+        return self.half_side is not None or self.centre is not None
+
+
+NO_HINTS = CubeHints()
 
 
 @dataclass(frozen=True)
@@ -156,9 +180,7 @@ def _projectors(views: Views) -> Tensor:
     return torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
 
 
-def scene_frame(
-    views: Views, half_side: float | None = None, points: Tensor | None = None
-) -> Frame:
+def scene_frame(views: Views, hints: CubeHints = NO_HINTS) -> Frame:
     """The frame of a scene: the smallest cube that its cameras and silhouettes allow.
 
     The cameras' common field of view gives a first cube around the point at which they look. The
@@ -169,19 +191,21 @@ def scene_frame(
 
     Args:
         views: Training views.
-        half_side: Half the side of the cube in world units; estimated when None.
-        points: World points on surfaces, if known. [N, 3]
+        hints: What is known of the cube.
 
     Raises:
         SceneError: If the cameras see no common volume.
     """
     centre, seen = optical_centre(views), None
-    if points is not None and views.is_opaque:
-        seen = _middle_box(views, points, centre)
+    if hints.points is not None and views.is_opaque:
+        seen = _middle_box(views, hints.points, centre)
     if seen is not None:
         centre = seen.mean(dim=0)
-    if half_side is not None:
-        return cube_frame(half_side, centre, "data.half_side")
+    given = ""
+    if hints.centre is not None:
+        centre, given = torch.tensor(hints.centre, dtype=torch.float32), "data.centre"
+    if hints.half_side is not None:
+        return cube_frame(hints.half_side, centre, _joined(given, "data.half_side"))
     offset = views.camera_to_world[:, :3, 3] - centre
     depth = (offset * views.camera_to_world[:, :3, 2]).sum(dim=-1)
     extent = (0.5 * views.intrinsics.size.flip(1) / views.intrinsics.pinhole).amax(dim=1)
@@ -194,11 +218,17 @@ def scene_frame(
             "world units"
         )
     if seen is not None:
-        return cube_frame(min(half, float((seen[1] - centre).max())), centre, "points")
+        reach = (seen - centre).abs().max()
+        return cube_frame(min(half, float(reach)), centre, _joined(given, "points"))
     spread = _spread(views)
     reach = MARGIN * _reach(views, centre) / spread if spread > 0 else math.inf
     source = "cameras" if half <= reach or views.is_opaque else "cameras and silhouettes"
-    return cube_frame(min(half, reach), centre, source)
+    return cube_frame(min(half, reach), centre, _joined(given, source))
+
+
+def _joined(first: str, second: str) -> str:
+    """Two sources of a cube, of which the first may be empty."""
+    return f"{first} and {second}" if first else second
 
 
 def pixels_across(views: Views, frame: Frame) -> float:

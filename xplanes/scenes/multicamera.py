@@ -90,6 +90,7 @@ class MultiCameraSettings(SceneSettings):
     orient: bool | None
 
     def check(self) -> None:
+        super().check()
         if self.frames is None:
             return
         if len(self.frames) != 3:

@@ -10,8 +10,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch
 
-from xplanes.errors import MissingSplitError, SceneError, warn
+from xplanes.errors import ConfigError, MissingSplitError, SceneError, warn
 from xplanes.scenes.entries import some, world_turn
+from xplanes.scenes.frame import CubeHints
 from xplanes.scenes.listing import Listing, Part, read_splits, thinned
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.views import Scene, Views, joined
@@ -75,6 +76,7 @@ class SceneSettings(Settings, ABC):
     eval_split: Literal["test", "val"] | None  # Split to score; null: val, then test at the end.
     eval_views: Count | None  # Maximum views per scored split, spread over time; null for all.
     half_side: Positive | None  # Half the side of the scene's bounding cube; null estimates it.
+    centre: Sequence[float] | None  # Its centre, three world coordinates; null estimates it.
     cache: Location | None  # Folder for images too large for memory; null: the user's cache.
 
     files: ClassVar[str] = ""
@@ -82,6 +84,14 @@ class SceneSettings(Settings, ABC):
 
     hint: ClassVar[str] = ""
     """Further advice if there is no such scene."""
+
+    def check(self) -> None:
+        if self.centre is not None and len(self.centre) != 3:
+            raise ConfigError(f"centre={self.centre}: must be three world coordinates, [x,y,z]")
+
+    def hints(self, scene: Scene) -> CubeHints:
+        """What is known of a scene's cube."""
+        return CubeHints(self.half_side, self.centre, scene.points)
 
     @property
     def folder(self) -> Path:

@@ -191,7 +191,7 @@ def inspect(choice: Choice) -> Capture:
     train = scene.splits["train"]
     frame, problem = None, ""
     try:
-        frame = model.frame(train, choice.scene.half_side, scene.points)
+        frame = model.frame(train, choice.scene.hints(scene))
     except SceneError as error:
         problem = str(error)
     images = {

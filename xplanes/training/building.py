@@ -14,7 +14,7 @@ from xplanes.fields.base import Representation
 from xplanes.models.base import Model, ModelSettings
 from xplanes.models.initialisation import Initialisation, Method, Place
 from xplanes.rendering.sampler import Sampler, Site
-from xplanes.scenes.frame import Frame, frame_content, pixels_of_detail, read_frame
+from xplanes.scenes.frame import CubeHints, Frame, frame_content, pixels_of_detail, read_frame
 from xplanes.scenes.views import Scene
 
 ANOTHER_SEED = 1_000_003
@@ -86,7 +86,7 @@ def build_parts(
     method: Method,
     scene: Scene,
     *,
-    half_side: float | None = None,
+    hints: CubeHints | None = None,
     device: torch.device | None = None,
     devices: int = 1,
     initialise: Initialise | None = None,
@@ -98,7 +98,7 @@ def build_parts(
     Args:
         method: All settings except those of the data and the Trainer.
         scene: The scene, with a ``train`` split.
-        half_side: Half the side of the scene's cube in world units; estimated when None.
+        hints: What is known of the scene's cube; the scene's points when None.
         device: Device on which the field will be trained; the CPU when None.
         devices: Number of processes that share the run.
         initialise: Function that computes the initialisation; taken from ``lrm`` when None.
@@ -111,12 +111,13 @@ def build_parts(
     """
     views, rays = scene.splits["train"], method.model.rays
     device = device or torch.device("cpu")
-    frame = frame or method.model.frame(views, half_side, scene.points)
+    hints = hints or CubeHints(points=scene.points)
+    frame = frame or method.model.frame(views, hints)
     if initialise is None and (source := method.lrm.load(say)) is not None:
         initialise = source.initialise
     found = Initialisation(method.model, frame)
     if initialise is not None:
-        found = initialise(method, Place(scene, frame, device, devices, say, half_side))
+        found = initialise(method, Place(scene, frame, device, devices, say, hints))
     resolved = rays.on(device)
     site = Site(
         frame=found.frame,

@@ -162,7 +162,7 @@ class RadianceModule(ViewScoring):
         with torch.device("cpu"):  # Lightning would create every tensor on the GPU.
             self.build(
                 data.scene,
-                half_side=data.settings.half_side,
+                hints=data.settings.hints(data.scene),
                 device=self.trainer.strategy.root_device,
                 devices=self.trainer.world_size,
             )
@@ -173,7 +173,7 @@ class RadianceModule(ViewScoring):
         Args:
             scene: The scene, with a ``train`` split.
             frame: The field's frame; chosen by the model when None.
-            **options: Further arguments of `build_parts`: ``half_side``, ``device``, ``devices``,
+            **options: Further arguments of `build_parts`: ``hints``, ``device``, ``devices``,
                 ``initialise``, ``say``.
 
         Raises:

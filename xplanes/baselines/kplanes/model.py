@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import torch
-from torch import Tensor
 
 from xplanes.baselines.kplanes.field import ExplicitDecoder, HybridDecoder, KPlanes
 from xplanes.baselines.products import PlaneProducts, PlaneTerms, Variation
@@ -15,10 +14,9 @@ from xplanes.rendering.sampler import (
     Site,
     fits_origin_cube,
     origin_cube,
-    scene_cube,
     seen_range,
 )
-from xplanes.scenes.frame import Frame
+from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame, scene_frame
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Positive, Settings, Steps, Weight
 from xplanes.streams import Stream, TrainingState, initial_values
@@ -64,18 +62,16 @@ class KPlanesSettings(ModelSettings):
                 f"space_low={self.space_low}: must not be above space_high={self.space_high}"
             )
 
-    def frame(self, views: Views, half_side: float | None, points: Tensor | None = None) -> Frame:
+    def frame(self, views: Views, hints: CubeHints = NO_HINTS) -> Frame:
         if self.half_side is None:
-            return scene_cube(views, half_side, points)
-        return origin_cube(self.half_side, views, half_side)
+            return scene_frame(views, hints)
+        return origin_cube(self.half_side, views, hints)
 
-    def for_scene(
-        self, views: Views, half_side: float | None, points: Tensor | None = None
-    ) -> "KPlanesSettings":
-        cube = scene_cube(views, half_side, points)
+    def for_scene(self, views: Views, hints: CubeHints = NO_HINTS) -> "KPlanesSettings":
+        cube = scene_frame(views, hints)
         near, far = seen_range(views, cube)
         fits = self.half_side is None or fits_origin_cube(self.half_side, cube)
-        if half_side is None and fits and self.sampler.holds(near, far):
+        if not hints.is_given and fits and self.sampler.holds(near, far):
             return self
         return replace(self, half_side=None, sampler=self.sampler.bounded(near, far))
 

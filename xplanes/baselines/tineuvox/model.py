@@ -13,9 +13,9 @@ from xplanes.errors import ConfigError
 from xplanes.models.background import BackgroundSettings
 from xplanes.models.base import InitialValues, Model, ModelSettings, colour_error
 from xplanes.rendering.base import Rendering
-from xplanes.rendering.sampler import Group, Site, origin_cube, scene_cube, seen_range
+from xplanes.rendering.sampler import Group, Site, origin_cube, seen_range
 from xplanes.scenes.batches import Batch
-from xplanes.scenes.frame import Frame, cube_frame
+from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame, cube_frame, scene_frame
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Positive, Range, Settings, Steps, Weight
 from xplanes.streams import Stream, TrainingState, initial_values
@@ -68,18 +68,16 @@ class TiNeuVoxSettings(ModelSettings):
             return frusta_box(views, self.near, self.far, self.margin)
         return torch.tensor([[-1.0] * 3, [1.0] * 3]) * self.half_side
 
-    def frame(self, views: Views, half_side: float | None, points: Tensor | None = None) -> Frame:
+    def frame(self, views: Views, hints: CubeHints = NO_HINTS) -> Frame:
         """The smallest cube around the world's origin that holds the grid's box."""
         if self.half_side is not None:
-            return origin_cube(self.half_side, views, half_side)
+            return origin_cube(self.half_side, views, hints)
         return cube_frame(float(self.bounds(views).abs().max()), torch.zeros(3))
 
-    def for_scene(
-        self, views: Views, half_side: float | None, points: Tensor | None = None
-    ) -> "TiNeuVoxSettings":
-        near, far = seen_range(views, scene_cube(views, half_side, points))
+    def for_scene(self, views: Views, hints: CubeHints = NO_HINTS) -> "TiNeuVoxSettings":
+        near, far = seen_range(views, scene_frame(views, hints))
         seen = self.near <= near and far <= self.far and self.sampler.holds(near, far)
-        if half_side is None and seen:
+        if seen and not hints.is_given:
             return self
         sampler = self.sampler.bounded(near, far)
         return replace(self, near=near, far=far, half_side=None, sampler=sampler)

@@ -38,7 +38,7 @@ from xplanes.scenes import batches
 from xplanes.scenes.batches import DeviceBatches
 from xplanes.training.clock import SHARED, TrainingClock
 from xplanes.training.diagnosis import TrainingError
-from xplanes.training.fit import warm_up
+from xplanes.training.fit import warm_up_loops
 from xplanes.training.interrupt import Interrupt, Stopped
 from xplanes.training.meters import due
 from xplanes.training.scores import score_view
@@ -230,7 +230,7 @@ def test_warming_up_does_all_of_a_step_and_changes_nothing(fake_gpu):
     before = {name: value.cpu().clone() for name, value in module.state_dict().items()}
     module.zero_grad(set_to_none=True)
     with fake_device.counted() as counts:
-        warm_up(module, data, fake_gpu)
+        warm_up_loops(module, data, fake_gpu)
     for name in ("_fused_adam_", "scatter_reduce_", "grid_sampler_2d_backward"):
         assert counts.operations[name], name
     assert counts.waits["synchronize"] == 1

@@ -4,7 +4,6 @@ import logging
 import os
 import shutil
 import time
-import traceback
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from xplanes.backend import warm_up
 from xplanes.errors import ConfigError, SceneError, XPlanesError
-from xplanes.evaluation.findings import camera_findings, opaque_findings, stray_findings
+from xplanes.evaluation.findings import scene_findings
 from xplanes.evaluation.render import FRAMES, write_orbit
 from xplanes.evaluation.report import closing, header, log_hparams, rest, summary, write_pictures
 from xplanes.experiment import Experiment
@@ -31,8 +30,7 @@ from xplanes.scenes.datamodule import SceneDataModule, found_root
 from xplanes.training.checkpoints import find_resumable, has_checkpoint
 from xplanes.training.clock import find_callback, training_seconds
 from xplanes.training.evaluation import Evaluation
-from xplanes.training.fit import Trainer, estimate
-from xplanes.training.fit import warm_up as warm_up_loops
+from xplanes.training.fit import Trainer, estimate, warm_up_loops
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import (
     RunRecord,
@@ -47,7 +45,6 @@ logger = logging.getLogger(__name__)
 
 KNOWN_ERRORS = (XPlanesError, MisconfigurationException)
 """Errors reported by their message alone; the traceback is written to train.log only."""
-
 
 REFUSALS = (ConfigError, SceneError, LRMError, MissingExtraError)
 """Errors in settings, data or weights: the run cannot begin."""
@@ -151,7 +148,7 @@ def _recorded(job: Job, overrides: list[str], *, resume: bool, began: float | No
             say(f"\nstopped. Resume with: {resume_command(folder)}")
             raise
         except BaseException as error:
-            logger.error("failed\n%s", traceback.format_exc())
+            logger.exception("failed")
             # On a full disk the status stays "running", as after a power cut; resume= accepts both.
             with suppress(StorageError):
                 record.end("failed", f"{type(error).__name__}: {error}")
@@ -185,8 +182,7 @@ def train(
     hints = settings.hints(scene)
     frame = method.model.frame(views, hints)
     if record is not None:
-        findings = *camera_findings(scene, frame), *opaque_findings(scene), *stray_findings(scene)
-        for finding in findings:
+        for finding in scene_findings(scene, frame):
             logger.warning("%s", finding.text)
     loaded = time.perf_counter() - warm_up.seconds - began
 
@@ -206,11 +202,9 @@ def train(
 
     # Training
     if record is not None:
-        record.note(
-            device=torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
-            precision=module.field.precision,
-            files={name: list(views.files) for name, views in scene.splits.items()},
-        )
+        name = torch.cuda.get_device_name() if device.type == "cuda" else "cpu"
+        files = {name: list(views.files) for name, views in scene.splits.items()}
+        record.note(device=name, precision=module.field.precision, files=files)
         warm_up_loops(module, data, device)
         expected = estimate(module, data)
         text = header(experiment, folder, data, module, overrides, expected, record.seconds)
@@ -234,8 +228,7 @@ def train(
     }
 
     # Report
-    skipped = data.batches_for(module, 0).skipped
-    metrics = summary(trainer, module, scores, data, seconds, skipped)
+    metrics = summary(trainer, module, scores, data, seconds)
     metrics["skipped"] |= found.skipped
     metrics["decomposition"] = found.report
     metrics["lrm"] = found.lrm

@@ -75,6 +75,13 @@ def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
         yield from _scale(train, frame)
 
 
+def scene_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
+    """Problems that a run warns of before it trains; arguments as for `camera_findings`."""
+    yield from camera_findings(scene, frame)
+    yield from opaque_findings(scene)
+    yield from stray_findings(scene)
+
+
 def opaque_findings(scene: Scene) -> Iterator[Finding]:
     """Finds opaque training images of objects in front of a constant background."""
     if scene.splits["train"].is_opaque and not scene.is_surrounded:

@@ -123,7 +123,6 @@ def summary(
     scores: Sequence[ViewScore],
     data: SceneDataModule,
     seconds: dict[str, Any],
-    background_skipped: float,
 ) -> dict[str, Any]:
     """The content of metrics.json."""
     clock = training_seconds(trainer)
@@ -145,7 +144,7 @@ def summary(
             "empty": counts["empty"] / candidates,
             "occluded": counts["occluded"] / candidates,
             "no_room": counts["no_room"] / max(1, counts["rays"] + counts["no_room"]),
-            "background": background_skipped,
+            "background": data.batches_for(module, 0).skipped,
             "static": float(not module.field.moves),
         },
         "steps_skipped": module.tally.skipped,

@@ -128,7 +128,7 @@ class Trainer(lightning.Trainer):
             TrainingError: If losses, gradients or parameters are no longer finite.
         """
         device = self.strategy.root_device
-        warm_up(module, data, device)
+        warm_up_loops(module, data, device)
         with self.interrupt.exits():
             try:
                 self.fit(module, data, ckpt_path=None if checkpoint is None else str(checkpoint))
@@ -209,7 +209,7 @@ def fit_quietly(
     trainer.train(module, data, find_resumable(folder / "checkpoints"))
 
 
-def warm_up(module: RadianceModule, data: SceneDataModule, device: torch.device) -> None:
+def warm_up_loops(module: RadianceModule, data: SceneDataModule, device: torch.device) -> None:
     """Run all loops once on a few rays, so that the training clock does not count compilation."""
     if device.type != "cpu":
         # The kernels' trial needs the training device; Lightning would move the module only later.

@@ -131,6 +131,7 @@ def test_text_and_binary_models_are_the_same(tmp_path):
         assert np.abs(model.camera_to_world - poses(3)[[1, 0, 2]]).max() < 1e-14
         assert [camera.w for camera in model.calibrations] == [20, 40, 40]
         assert model.points.tolist() == POINTS
+        assert model.error == 0.5
     assert all(model.calibrations == found[0].calibrations for model in found)
 
 
@@ -157,10 +158,31 @@ def test_rays_pixels_and_points(capture):
     assert half.images.shape[1:3] == (HEIGHT // 2, WIDTH // 2)
     torch.testing.assert_close(half.intrinsics.focal, views.intrinsics.focal / 2)
     torch.testing.assert_close(half.intrinsics.centre, views.intrinsics.centre / 2)
-    points = capture.read("train").points
-    assert points.tolist() == torch.tensor(POINTS).tolist()
+    scene = capture.read("train")
+    assert scene.points.tolist() == torch.tensor(POINTS).tolist()
+    words = "2, 0.50 px from where images show them on average"
+    assert scene.notes["points"] == words
     (capture.path / "sparse/0/points3D.bin").unlink()
-    assert capture.read("train").points is None
+    scene = capture.read("train")
+    assert scene.points is None
+    assert "points" not in scene.notes
+
+
+def test_cameras_that_fit_badly_are_worth_refining(capture):
+    """Two points with errors of 1 and 2 pixels, and one whose error COLMAP does not know."""
+    capture.write(text=True)
+    for path in (capture.path / "sparse/0").glob("*.bin"):
+        path.unlink()
+    path = capture.path / "sparse/0/points3D.txt"
+    errors = ("1", "2", "-1")
+    lines = [f"{k} 0 0 {k} 255 0 0 {error} 7 0" for k, error in enumerate(errors, start=1)]
+    path.write_text("\n".join(lines))
+    assert capture.read("train").notes["points"] == (
+        "3, 1.50 px from where images show them on average; data.refine_cameras=true corrects the "
+        "cameras in training"
+    )
+    path.write_text("1 0 0 1\n")
+    assert "points" not in capture.read("train").notes
 
 
 def test_the_world_is_turned_upright_as_a_whole(capture):

@@ -18,7 +18,9 @@ from xplanes.evaluation.render import FRAMES, VIDEO_SIZE
 from xplanes.experiment import Experiment
 from xplanes.process import resume_command
 from xplanes.rendering.pictures import write_png
+from xplanes.rendering.refining import RefiningSampler
 from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.views import Views
 from xplanes.training.checkpoints import LAST
 from xplanes.training.clock import training_seconds
 from xplanes.training.evaluation import affordable, log_image
@@ -147,12 +149,31 @@ def summary(
             "background": data.batches_for(module, 0).skipped,
             "static": float(not module.field.moves),
         },
+        **refined_cameras(module, data.scene.splits["train"]),
         "steps_skipped": module.tally.skipped,
         "restarts": module.restarts,
         "threads": torch.get_num_threads(),
         "loops": backend.name(module.device),
         "parameters": sum(p.numel() for p in module.parameters()),
         "peak_memory_bytes": device_memory(module.device),
+    }
+
+
+def refined_cameras(module: RadianceModule, views: Views) -> dict[str, Any]:
+    """``cameras``: how far those of the training views moved, and their poses; or nothing."""
+    frame, sampler = module.frame, module.sampler
+    if frame is None or not isinstance(sampler, RefiningSampler):
+        return {}
+    moved = sampler.cameras.moved[sampler.cameras.index].tolist()
+    poses = sampler.cameras.poses(views.camera_to_world, frame).tolist()
+    farthest = max(range(len(moved)), key=moved.__getitem__)
+    return {
+        "cameras": {
+            "mean_px": sum(moved) / len(moved),
+            "most_px": moved[farthest],
+            "farthest": views.files[farthest],
+            "camera_to_world": dict(zip(views.files, poses, strict=True)),
+        }
     }
 
 
@@ -247,10 +268,17 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
     steps = [*curves, f"xplanes render {place}{named}", resume_command(run) + more]
     steps = steps if kept else curves
     warm_up = f"compiling {seconds['warm_up']:.1f} s · " if seconds["warm_up"] >= 1 else ""
+    moved = []
+    if (cameras := metrics.get("cameras")) is not None:
+        moved.append(
+            f"cameras  moved by {cameras['mean_px']:.2f} px on average, at most by "
+            f"{cameras['most_px']:.2f} px ({cameras['farthest']}); poses in metrics.json"
+        )
     lines = [
         f"\n{metrics['split']:<9}{scores}  over {len(metrics['views'])} views, step "
         f"{metrics['step']}",
         *warnings,
+        *moved,
         f"time     prepare {sum(seconds['prepare'].values()):.1f} s + train "
         f"{seconds['train']:.1f} s · {warm_up}scoring {seconds['evaluate']:.1f} s · "
         f"{seconds['total']:.1f} s in all · {metrics['rays_per_second'] / 1000:.1f}k rays/s",

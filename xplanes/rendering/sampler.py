@@ -13,7 +13,14 @@ from xplanes.errors import ConfigError, SceneError
 from xplanes.fields.base import RadianceField, Representation
 from xplanes.rendering.base import Renderer, Rendering
 from xplanes.scenes.batches import Batch
-from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame, cube_frame, scene_frame
+from xplanes.scenes.frame import (
+    NO_HINTS,
+    CameraGroups,
+    CubeHints,
+    Frame,
+    cube_frame,
+    scene_frame,
+)
 from xplanes.scenes.views import Views
 from xplanes.settings import Settings
 from xplanes.streams import TrainingState
@@ -43,6 +50,7 @@ class Site:
         pixels: Image pixels that a side of the field's cube covers, see `pixels_of_detail`.
         surrounded: Whether the training images show surroundings, which lie behind the field's
             cube.
+        cameras: Training cameras whose poses are refined; None if they are taken as exact.
         device: Device on which the field will be trained; the CPU when None.
         samples_per_batch: Maximum average number of samples per training batch; None if unknown.
         batch_scale: Batch size relative to the one that schedules assume, see `steps`.
@@ -57,6 +65,7 @@ class Site:
     initialised: bool = False
     pixels: float = 0.0
     surrounded: bool = False
+    cameras: CameraGroups | None = None
     device: torch.device | None = None
     samples_per_batch: int | None = None
     batch_scale: float = 1.0

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from xplanes.backend import memory_left
+from xplanes.errors import ConfigError
+from xplanes.scenes.cameras import turned
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.pools import PixelPools, RunPools
 from xplanes.scenes.silhouettes import changing, foreground, plain
@@ -43,6 +45,9 @@ AHEAD = 8
 CPU_RAYS, CPU_SAMPLES = 1365, 8192
 """Largest batch on the CPU with per_batch=auto; schedules in steps assume this size."""
 
+SLOPES_OVER = 2
+"""Distance in pixels over which slopes of images are taken; the nearest pixels are noisier."""
+
 GPU_RAYS, GPU_SAMPLES = 2**15, 2**19
 """Largest batch on a GPU with per_batch=auto; small batches would leave it idle."""
 
@@ -59,6 +64,17 @@ class Batches(ABC):
     views: Views
     rays: int
     skipped: float
+
+    def add_slopes(self) -> None:
+        """Add to each batch what the refinement of cameras needs, see `RayBatches.slopes`.
+
+        Raises:
+            ConfigError: If these batches cannot.
+        """
+        raise ConfigError(
+            "data.refine_cameras=true: this model trains on whole views, but cameras are refined "
+            "with rays; set it to false, or choose model=six_planes"
+        )
 
     @abstractmethod
     def draw(self, step: int, rays: int | None = None) -> Batch:
@@ -228,7 +244,14 @@ class RayBatches(Batches):
         settings: The settings.
         seed: The run's seed.
         rank: Rank of this process among those that split the rays.
+
+    Attributes:
+        slopes: Whether batches have ``view``, the index of each ray's view, int64 [R]; ``across``,
+            the changes of its direction by one pixel to the right and down, [R, 2, 3]; and
+            ``slopes``, those of the target colour by smoothed differences (Sobel), [R, 3, 2].
     """
+
+    slopes = False
 
     def __init__(
         self, views: Views, frame: Frame, settings: RaySettings, *, seed: int, rank: int = 0
@@ -264,6 +287,14 @@ class RayBatches(Batches):
         self.skipped = natural + plain_natural - self.far_share - self.plain_share
         self.pools.share(self.far_share, self.plain_share)
 
+    def add_slopes(self) -> None:
+        if isinstance(self.views.images, StoredImages):
+            raise ConfigError(
+                "data.refine_cameras=true: the images are too large for memory, and cameras are "
+                "refined with images in memory; set data.resolution to a smaller width"
+            )
+        self.slopes = True
+
     def draw(self, step: int, rays: int | None = None) -> Batch:
         """The batch of a step.
 
@@ -274,7 +305,7 @@ class RayBatches(Batches):
         Returns:
             ``origins`` and unit ``directions`` in the field's frame [R, 3], ``times`` [R],
             ``target`` colour on ``background`` [R, 3] each, its ``alpha`` [R], and ``jitter``
-            from 0 to 1 [R].
+            from 0 to 1 [R]. More with `slopes`.
         """
         rays = rays or self.rays
         generator = step_generator(self.seed, step, self.rank)
@@ -304,7 +335,8 @@ class RayBatches(Batches):
         origins, directions = self.views.pixel_rays(view, row.float(), column.float())
         origins, directions = self.frame.rays(origins, directions)
         colour = colour.float() / 255
-        return {
+        more = self._slopes(view, row, column, background) if self.slopes else {}
+        return more | {
             "origins": origins,
             "directions": directions,
             "times": self._times(view, far & (colour[:, 3] == 0), move),
@@ -313,6 +345,28 @@ class RayBatches(Batches):
             "alpha": colour[:, 3],
             "jitter": jitter,
         }
+
+    def _slopes(self, view: Tensor, row: Tensor, column: Tensor, background: Tensor) -> Batch:
+        """What `slopes` adds to a batch of drawn pixels."""
+        places = (row, column), (row, column + 1), (row + 1, column)
+        ray, *others = (self.views.pixel_rays(view, *(x.float() for x in at))[1] for at in places)
+        across = torch.stack([turned(other - ray, self.frame.rotation) for other in others], dim=1)
+        images = self.views.images
+        assert isinstance(images, Tensor)
+        last = self.views.intrinsics.size.to(view.device)[view] - 1
+        offsets = torch.arange(-SLOPES_OVER, SLOPES_OVER + 1, SLOPES_OVER, device=view.device)
+        rows, columns = (
+            torch.minimum((at[:, None] + offsets).clamp(min=0), last[:, k, None])
+            for k, at in enumerate((row, column))
+        )
+        around = images[view[:, None, None], rows[:, :, None], columns[:, None]].float() / 255
+        step = offsets / (2 * SLOPES_OVER**2)
+        smooth = torch.tensor([0.25, 0.5, 0.25], device=view.device)
+        kernels = torch.stack([torch.outer(smooth, step), torch.outer(step, smooth)])
+        slopes = torch.einsum("rijc,kij->rck", around, kernels)
+        # Images are stored multiplied by alpha.
+        slopes = slopes[:, :3] - background[..., None] * slopes[:, 3:]
+        return {"view": view, "across": across, "slopes": slopes}
 
     def _from_memory(self, images: Tensor, uniform: Tensor) -> tuple[Tensor, ...]:
         """Whether far, view, row, column and colour of independently drawn pixels. [R], [R, 4]"""

@@ -3,11 +3,12 @@
 import csv
 import io
 import logging
+import math
 import os
 import re
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import ClassVar
 
@@ -35,6 +36,9 @@ from xplanes.scenes.views import Scene
 from xplanes.settings import Location
 
 logger = logging.getLogger(__name__)
+
+DOUBTFUL = 1.0
+"""Mean error of COLMAP's points in pixels above which its cameras are worth refining."""
 
 USUAL = "images"
 """Default folder of images."""
@@ -107,7 +111,13 @@ class ColmapSettings(CaptureSettings):
         model = read_model(source)
         listing, folders, points = self._listing(model)
         places = self._places(listing, folders)
-        return self.capture(listing, places, splits, model.source, points)
+        scene = self.capture(listing, places, splits, model.source, points)
+        if points is None or math.isnan(model.error):
+            return scene
+        words = f"{len(points)}, {model.error:.2f} px from where images show them on average"
+        if model.error > DOUBTFUL:
+            words += "; data.refine_cameras=true corrects the cameras in training"
+        return replace(scene, notes={**scene.notes, "points": words})
 
     def _listing(self, model: SparseModel) -> tuple[Listing, list[str], np.ndarray | None]:
         """All images of the capture, the folder of each, and the model's points."""

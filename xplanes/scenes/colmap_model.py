@@ -71,6 +71,7 @@ class SparseModel:
         camera_to_world: Poses with OpenGL's axes, in COLMAP's world. float64 [V, 4, 4]
         calibrations: Cameras and lenses. [V]
         points: Triangulated points; None where there is no file of them. float64 [N, 3]
+        error: Their mean distance in pixels from where images show them; NaN if unknown.
     """
 
     source: Path
@@ -78,6 +79,7 @@ class SparseModel:
     camera_to_world: np.ndarray
     calibrations: tuple[Calibration, ...]
     points: np.ndarray | None
+    error: float = math.nan
 
     def subset(self, places: Sequence[int]) -> "SparseModel":
         """The images at ``places``, in that order, and all points."""
@@ -140,13 +142,9 @@ def read_model(folder: Path) -> SparseModel:
             )
     names, poses, numbers = zip(*images, strict=True)
     points_path = _found(folder, "points3D")
-    return SparseModel(
-        images_path,
-        names,
-        np.stack(poses),
-        tuple(cameras[camera] for camera in numbers),
-        None if points_path is None else _positions(points_path),
-    )
+    points, error = (None, math.nan) if points_path is None else _points(points_path)
+    calibrations = tuple(cameras[camera] for camera in numbers)
+    return SparseModel(images_path, names, np.stack(poses), calibrations, points, error)
 
 
 def _found(folder: Path, name: str) -> Path | None:
@@ -312,33 +310,36 @@ def _images(path: Path) -> Iterator[tuple[str, np.ndarray, int]]:
         )
 
 
-def _positions(path: Path) -> np.ndarray:
-    """The points of a file. float64 [N, 3]"""
+def _points(path: Path) -> tuple[np.ndarray, float]:
+    """The points of a file, float64 [N, 3], and their mean error in pixels; NaN if unknown."""
     points = []
     if path.suffix == ".bin":
         with _binary(path) as file:
             for what in file.entries("point"):
-                _, *position, _, _, _, _, seen_by = file.take(POINT, what)
+                _, *position, _, _, _, error, seen_by = file.take(POINT, what)
                 file.skip(TRACK_ENTRY * seen_by, what)
-                points.append(position)
+                points.append((*position, error))
     else:
 
         def parse(words: list[str]) -> tuple[float, ...]:
-            return float(words[1]), float(words[2]), float(words[3])
+            error = float(words[7]) if len(words) > 7 else math.nan
+            return float(words[1]), float(words[2]), float(words[3]), error
 
         points = [
-            _parsed(label, line, "POINT3D_ID X Y Z ...", parse, most=4)
+            _parsed(label, line, "POINT3D_ID X Y Z ...", parse, most=8)
             for label, line in _text_lines(path)
             if line
         ]
-    positions = np.array(points, dtype=np.float64).reshape(-1, 3)
+    values = np.array(points, dtype=np.float64).reshape(-1, 4)
+    positions, errors = values[:, :3], values[:, 3]
     bad = ~np.isfinite(positions).all(axis=1)
     if bad.any():
         raise SceneError(
             f"{path}: point {int(bad.argmax()) + 1} of {len(points)} lies at "
             f"{positions[bad][0].tolist()}. Remove it, or export the model again."
         )
-    return positions
+    errors = errors[np.isfinite(errors) & (errors >= 0)]  # COLMAP writes -1 for unknown ones.
+    return positions, float(errors.mean()) if len(errors) else math.nan
 
 
 def _calibration(

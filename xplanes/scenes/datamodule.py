@@ -233,6 +233,8 @@ class SceneDataModule(LightningDataModule):
             frame = frame or scene_frame(views, self.settings.hints(self.scene))
             settings = getattr(module, "ray_settings", UNIFORM)
             self._batches[rank] = settings.batches(views, frame, seed=self.seed, rank=rank)
+            if self.scene.refine_cameras:
+                self._batches[rank].add_slopes()
         return self._batches[rank]
 
     def train_dataloader(self) -> DataLoader:
@@ -371,6 +373,7 @@ class _GivenScene(SceneSettings):
             eval_views=None,
             half_side=None,
             centre=None,
+            refine_cameras=scene.refine_cameras,
             cache=None,
         )
 

@@ -87,6 +87,25 @@ class Frame:
         return turned(points, self.rotation.T) / self.scale + self.centre
 
 
+@dataclass(frozen=True)
+class CameraGroups:
+    """Which training views share a pose, and where they stand.
+
+    Attributes:
+        index: The pose of each view. int64 [V]
+        places: Positions in the field's frame. [C, 3]
+    """
+
+    index: Tensor
+    places: Tensor
+
+    @classmethod
+    def of(cls, views: Views, frame: Frame) -> "CameraGroups":
+        """The groups of the training views: the images of a fixed camera are one."""
+        poses, index = views.camera_to_world.unique(dim=0, return_inverse=True)
+        return cls(index, frame.points(poses[:, :3, 3].float()))
+
+
 def frame_content(frame: Frame) -> dict[str, Any]:
     """A frame as tensors and builtins, for files."""
     return {"scale": frame.scale, "rotation": frame.rotation, "centre": frame.centre}

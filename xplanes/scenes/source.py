@@ -77,6 +77,7 @@ class SceneSettings(Settings, ABC):
     eval_views: Count | None  # Maximum views per scored split, spread over time; null for all.
     half_side: Positive | None  # Half the side of the scene's bounding cube; null estimates it.
     centre: Sequence[float] | None  # Its centre, three world coordinates; null estimates it.
+    refine_cameras: bool  # Correct the poses of the training cameras while the field is trained.
     cache: Location | None  # Folder for images too large for memory; null: the user's cache.
 
     files: ClassVar[str] = ""
@@ -217,7 +218,7 @@ class SceneSettings(Settings, ABC):
                     "(transforms_video.json); set it to false"
                 )
             parts["train"] = joined(parts["train"], scene.video)
-        scene = replace(scene, name=self.scene, splits=parts)
+        scene = replace(scene, name=self.scene, splits=parts, refine_cameras=self.refine_cameras)
         if self.static:
             return as_static(scene, "data.static=true")
         if self.static is None and scene.video is not None and frames_are_equal(scene.video):

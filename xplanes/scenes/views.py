@@ -488,6 +488,7 @@ class Scene:
             float32 [N, 3]
         cut: Training views masked to the foreground object, for LRMs, if ``splits`` show whole
             images; None if the alpha of ``splits`` contains the masks, or there are no masks.
+        refine_cameras: Whether training corrects the poses of its cameras.
         notes: Observations made while reading the scene: sentences by subject.
     """
 
@@ -498,6 +499,7 @@ class Scene:
     static_reason: str = ""
     points: Tensor | None = None
     cut: Views | None = None
+    refine_cameras: bool = False
     notes: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property

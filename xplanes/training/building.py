@@ -13,8 +13,16 @@ from xplanes.errors import ConfigError
 from xplanes.fields.base import Representation
 from xplanes.models.base import Model, ModelSettings
 from xplanes.models.initialisation import Initialisation, Method, Place
+from xplanes.rendering.refining import RefiningSampler
 from xplanes.rendering.sampler import Sampler, Site
-from xplanes.scenes.frame import CubeHints, Frame, frame_content, pixels_of_detail, read_frame
+from xplanes.scenes.frame import (
+    CameraGroups,
+    CubeHints,
+    Frame,
+    frame_content,
+    pixels_of_detail,
+    read_frame,
+)
 from xplanes.scenes.views import Scene
 
 ANOTHER_SEED = 1_000_003
@@ -69,6 +77,8 @@ class Parts:
             )
         settings.sampler.require_kind(type(field))
         sampler = settings.sampler.build(field, site)
+        if site.cameras is not None:
+            sampler = RefiningSampler(sampler, site.cameras, site.batch_scale)
         require_groups(model, sampler)
         return cls(settings, site, model, sampler, initialisation)
 
@@ -130,6 +140,7 @@ def build_parts(
         initialised=found.values is not None,
         pixels=pixels_of_detail(views, found.frame, scene.is_surrounded),
         surrounded=scene.is_surrounded,
+        cameras=CameraGroups.of(views, found.frame) if scene.refine_cameras else None,
         device=device,
         samples_per_batch=resolved.most_samples,
         batch_scale=resolved.most / rays.most if rays.most else 1.0,
@@ -151,6 +162,7 @@ def site_content(parts: Parts) -> dict[str, Any]:
         "initialised": site.initialised,
         "pixels": site.pixels,
         "surrounded": site.surrounded,
+        "cameras": None if site.cameras is None else vars(site.cameras),
     }
 
 
@@ -172,6 +184,7 @@ def parts_from(
         settings = build(content["model"], ModelSettings, "model")
     if not content["initialised"] or settings.name != method.model.name:
         settings = method.model  # If it is another model, loading its weights will fail.
+    cameras = content.get("cameras")
     site = Site(
         frame=read_frame(content["frame"], "the checkpoint"),
         times=content["times"],
@@ -180,6 +193,7 @@ def parts_from(
         bounds=content["bounds"],
         pixels=content["pixels"],
         surrounded=content["surrounded"],
+        cameras=None if cameras is None else CameraGroups(**cameras),
         samples_per_batch=samples,
     )
     return Parts.assemble(settings, site)

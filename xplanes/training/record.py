@@ -28,8 +28,8 @@ logger = logging.getLogger(__name__)
 
 KEPT = """model.name lrm.name model.sampler.name data.name data.scene data.seed data.resolution
 data.views data.train_views data.train_on_video data.static data.half_side data.centre
-data.eval_split data.eval_every data.test_cameras data.frames data.protocol data.masks data.mask_use
-data.model data.images data.orient data.times data.time_pattern""".split()
+data.refine_cameras data.eval_split data.eval_every data.test_cameras data.frames data.protocol
+data.masks data.mask_use data.model data.images data.orient data.times data.time_pattern""".split()
 """Settings that determine the planes, their frame and their content; paths do not count."""
 
 

@@ -1,0 +1,255 @@
+"""Cameras whose poses are slightly wrong are corrected while a field is trained."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from lightning import Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+
+from tests.balls import ball_scene, surrounding
+from tests.training.runs import checkpoint, metrics, small_config
+from xplanes import RadianceModule
+from xplanes.errors import ConfigError
+from xplanes.rendering import refining
+from xplanes.rendering.base import Rendering
+from xplanes.rendering.refining import CameraCorrections, rotations, without_common
+from xplanes.run import run
+from xplanes.scenes.batches import RayBatches, RaySettings, ViewBatches, ViewSettings
+from xplanes.scenes.cameras import project
+from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.frame import CameraGroups, cube_frame
+from xplanes.scenes.views import Views
+
+SIZE, FOCAL, RADIUS = 64, 80.0, 0.8
+FRAME = cube_frame(1.25, torch.tensor([0.1, 0.0, -0.1]))
+
+
+def ball(origins, directions):
+    """Colour, opacity and depth of a painted ball in a painted world, in the field's frame."""
+    along = -(origins * directions).sum(dim=-1)
+    half = RADIUS**2 - (origins.square().sum(dim=-1) - along.square())
+    hit = half > 0
+    depth = along - half.clamp(min=0).sqrt()
+    points = origins + depth[:, None] * directions
+    colour = 0.5 + 0.25 * (torch.sin(7 * points) + torch.cos(5 * points.roll(1, dims=-1)))
+    sky = 0.5 + 0.4 * torch.sin(6 * directions)
+    opacity = hit.float()
+    return torch.where(hit[:, None], colour, sky), opacity, opacity * depth
+
+
+def views_of(poses):
+    """What cameras see of the ball, in the world of `FRAME`. poses [V, 4, 4]"""
+    blank = torch.full((len(poses), SIZE, SIZE, 4), 255, dtype=torch.uint8)
+    files = tuple(f"{number}.png" for number in range(len(poses)))
+    views = Views(blank, poses, torch.linspace(0, 1, len(poses)), FOCAL, files)
+    for index, image in enumerate(blank):
+        colour, _, _ = ball(*FRAME.rays(*views.image_rays(index)))
+        image[..., :3] = (255 * colour).round().byte().view(SIZE, SIZE, 3)
+    return views
+
+
+def disturbed(poses, pixels, seed=3):
+    """Poses with random turns and shifts that move the ball by about so many pixels."""
+    generator = torch.Generator().manual_seed(seed)
+    size = torch.tensor([[1.0], [float(poses[0, :3, 3].norm())]]) * 0.5 * pixels / FOCAL
+    turn, shift = torch.randn(2, len(poses), 3, generator=generator) * size[:, None]
+    found = poses.clone()
+    found[:, :3, :3] = rotations(turn) @ poses[:, :3, :3]
+    found[:, :3, 3] += shift
+    return found
+
+
+def apart(poses, truth):
+    """Pixels by which points of the ball are displaced, without a common motion and scale. [V]"""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(40, 3, generator=generator, dtype=torch.float64)
+    points = FRAME.centre.double() + RADIUS / FRAME.scale * points / points.norm(dim=1)[:, None]
+
+    lens = {"focal": torch.tensor([FOCAL, FOCAL]), "centre": torch.tensor([SIZE / 2, SIZE / 2])}
+
+    def seen(points, poses=poses):
+        images = [project(pose.double(), points, **lens)[:2] for pose in poses]
+        return torch.cat([torch.stack(image).flatten() for image in images])
+
+    wanted = seen(points, truth)
+    here, columns, step = seen(points), [], 1e-5
+    for k in range(7):  # Derivatives by a motion and a growth of all points.
+        moved = points.clone()
+        if k < 3:
+            moved[:, k] += step
+        elif k < 6:
+            axis = torch.eye(3, dtype=torch.float64)[k - 3].expand_as(points)
+            moved = moved + step * torch.linalg.cross(axis, points)
+        else:
+            moved = moved * (1 + step)
+        columns.append((seen(moved) - here) / step)
+    jacobian, difference = torch.stack(columns, dim=1), wanted - here
+    common = torch.linalg.lstsq(jacobian, difference[:, None]).solution
+    rest = (difference - (jacobian @ common)[:, 0]).view(len(poses), 2, -1)
+    return rest.square().sum(dim=1).mean(dim=1).sqrt()
+
+
+def batches_of(views, rays=2048):
+    settings = RaySettings(
+        per_batch=rays,
+        samples_per_batch=8192,
+        background="white",
+        skip_background=False,
+        background_share=1.0,
+        background_jitter=0.0,
+    )
+    batches = RayBatches(views, FRAME, settings, seed=0)
+    batches.add_slopes()
+    return batches
+
+
+def refined(views, rounds=12):
+    """Corrections of the cameras of ``views`` in front of the true ball."""
+    batches = batches_of(views)
+    cameras = CameraCorrections(CameraGroups.of(views, FRAME))
+    for step in range(8 * rounds):
+        rays = cameras.corrected(batches.draw(step))
+        colour, opacity, depth = ball(rays["origins"], rays["directions"])
+        seen = Rendering(colour, opacity, depth, torch.empty(0), None)  # pyright: ignore
+        cameras.observe(rays, seen)
+        if step % 8 == 7:
+            cameras.solve()
+    return cameras
+
+
+def test_cameras_return_to_where_they_stood(monkeypatch):
+    # This field is exact and does not follow the cameras: nothing about their place is arbitrary.
+    monkeypatch.setattr(refining, "PULL", 0.0)
+    monkeypatch.setattr(refining, "without_common", lambda places, motion, metric, known: motion)
+    truth = surrounding(10, 4.0)
+    views = views_of(truth)
+    wrong = disturbed(truth, 2.5)
+    before = apart(wrong, truth)
+    cameras = refined(replace(views, camera_to_world=wrong))
+    after = apart(cameras.poses(wrong, FRAME), truth)
+    assert before.mean() > 1.5
+    assert after.max() < 0.1
+    # The poses in the world are those whose rays were cast.
+    found = replace(views, camera_to_world=cameras.poses(wrong, FRAME))
+    rays = batches_of(replace(views, camera_to_world=wrong)).draw(0)
+    expected = batches_of(found).draw(0)
+    corrected = cameras.corrected(rays)
+    for name in ("origins", "directions", "across"):
+        assert torch.allclose(corrected[name], expected[name], atol=2e-6), name
+    # What they are said to have moved is what is seen of the ball.
+    moved = apart(cameras.poses(wrong, FRAME), wrong)
+    assert cameras.moved[cameras.index].mean() == pytest.approx(float(moved.mean()), rel=0.25)
+
+
+def test_exact_cameras_stay_and_a_fixed_camera_has_one_pose():
+    poses = surrounding(5, 4.0).repeat_interleave(3, dim=0)
+    cameras = refined(views_of(poses), rounds=3)
+    assert len(cameras.motion) == 5
+    assert len(cameras.index.view(5, 3).unique(dim=1).T) == 1
+    assert cameras.moved.max() < 0.05
+
+
+def test_what_the_field_can_undo_is_removed():
+    generator = torch.Generator().manual_seed(1)
+    places = torch.randn(6, 3, generator=generator, dtype=torch.float64)
+    own = torch.randn(6, 6, generator=generator, dtype=torch.float64)
+    root = torch.randn(6, 6, 6, generator=generator, dtype=torch.float64)
+    metric, known = root @ root.mT + torch.eye(6), torch.ones(6, dtype=torch.bool)
+    turn, shift = torch.tensor([0.1, -0.2, 0.3]).double(), torch.tensor([1.0, 2.0, -1.0]).double()
+    common = torch.cat(
+        [
+            turn.expand(6, 3),
+            torch.linalg.cross(turn.expand(6, 3), places) + shift + 0.4 * places,
+        ],
+        dim=1,
+    )
+    alone = without_common(places, own, metric, known)
+    assert torch.allclose(without_common(places, own + common, metric, known), alone, atol=1e-9)
+    # A camera without rays stays as it was.
+    known[2] = False
+    assert torch.equal(without_common(places, own, metric, known)[2], own[2])
+
+
+def test_rays_that_say_nothing_move_nothing():
+    views = views_of(surrounding(4, 4.0))
+    cameras = CameraCorrections(CameraGroups.of(views, FRAME))
+    rays = batches_of(views).draw(0)
+    blank = torch.zeros(len(rays["times"]))
+    for colour in (torch.full_like(rays["target"], torch.nan), rays["target"]):
+        cameras.observe(rays, Rendering(colour, blank, blank, blank, None))  # pyright: ignore
+        cameras.solve()
+        assert torch.equal(cameras.motion, torch.zeros(4, 6))
+        assert torch.equal(cameras.steepness, torch.zeros(4, 6, 6).double())
+
+
+def test_slopes_are_those_of_the_colours():
+    """On a plane of colours the differences are exact, with the background behind its alpha."""
+    views = views_of(surrounding(2, 4.0))
+    row, column = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
+    planes = torch.stack([2 * column, 3 * row, column + row, 128 + column], dim=-1)
+    images = planes.clamp(max=255).to(torch.uint8).expand(2, -1, -1, -1).contiguous()
+    rays = batches_of(replace(views, images=images)).draw(0)
+    _, pixel = torch.where(rays["alpha"][:, None] * 255 == torch.arange(256.0))
+    inside = (pixel - 128 >= 2) & (pixel - 128 < SIZE - 2)
+    expected = torch.tensor([[2.0, 0], [0, 3], [1, 1]]) - torch.tensor([[1.0, 0]])
+    slopes = rays["slopes"][inside] * 255
+    middle = slopes[:, 1, 1].isclose(torch.tensor(3.0), atol=1e-4).float().mean()
+    assert middle > 0.85  # All but the uppermost and lowest rows.
+    assert torch.allclose(slopes[..., 0], expected[:, 0].expand(len(slopes), 3), atol=1e-4)
+    assert (rays["across"].mul(rays["directions"][:, None]).sum(dim=-1).abs() < 2e-2).all()
+
+
+def test_batches_without_rays_in_memory_are_refused():
+    views = views_of(surrounding(2, 4.0))
+    with pytest.raises(ConfigError, match=r"refine_cameras=true: this model trains on whole views"):
+        ViewBatches(views, ViewSettings(background="white"), seed=0).add_slopes()
+
+
+@pytest.fixture
+def soon(monkeypatch):
+    """Corrections from the fourth step on."""
+    for name, value in (("FIRST", 4), ("EVERY", 2), ("LEAST_RAYS", 5.0)):
+        monkeypatch.setattr(refining, name, value)
+
+
+def test_a_run_refines_its_cameras(soon, scenes, tmp_path):
+    few = ("data.refine_cameras=true", "callbacks.evaluation.at=[]", "logger=none")
+    folder = tmp_path / "run"
+    run(small_config(scenes, *few, "trainer.max_steps=9"), folder, [], resume=False)
+    found = metrics(folder)["cameras"]
+    assert 0 < found["mean_px"] <= found["most_px"]
+    assert found["farthest"] in found["camera_to_world"]
+    assert "cameras  moved by" in (folder / "train.log").read_text()
+    state = checkpoint(folder)["state_dict"]
+    loaded = RadianceModule.load_from_checkpoint(folder / "checkpoints" / "last.ckpt")
+    for name, value in loaded.state_dict().items():
+        assert torch.equal(value, state[name]), name
+    exact = small_config(scenes, *few, "data.refine_cameras=false", "trainer.max_steps=12")
+    with pytest.raises(ConfigError, match=r"trained with data\.refine_cameras=True"):
+        run(exact, folder, [], resume=True)
+
+
+def test_refinement_goes_on_exactly(soon, scenes, tmp_path):
+    """From a checkpoint between two corrections, with sums that are half done."""
+    scene = replace(ball_scene(), refine_cameras=True)
+    kept = ModelCheckpoint(tmp_path, "{step}", save_top_k=-1, every_n_train_steps=7)
+    found = []
+    for path in (None, tmp_path / "step=7.ckpt"):
+        module = RadianceModule(small_config(scenes))
+        trainer = Trainer(
+            accelerator="cpu", max_steps=12, max_epochs=-1, limit_val_batches=0, logger=False,
+            enable_progress_bar=False, enable_model_summary=False, callbacks=[kept],
+        )  # fmt: skip
+        trainer.fit(module, SceneDataModule.of(scene), ckpt_path=path)
+        found.append(module.state_dict())
+    assert found[0]["cameras.motion"].abs().max() > 0
+    for name, value in found[0].items():
+        assert torch.equal(value, found[1][name]), name
+
+
+def test_a_scene_in_python_says_whether_its_cameras_are_refined():
+    scene = ball_scene()
+    for wanted in (False, True):
+        data = SceneDataModule.of(replace(scene, refine_cameras=wanted))
+        assert ("slopes" in data.batches(0).draw(0)) == wanted

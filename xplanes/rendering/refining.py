@@ -1,0 +1,299 @@
+"""Corrects the poses of training cameras while a field is trained on their images.
+
+An image and its rendering from a pose that is slightly wrong are displaced. To first order the
+difference of their colours is the image's gradient times the displacement of its pixels, which the
+rays' depths turn into a motion of the camera (Lucas and Kanade, 1981, in three dimensions). Each
+batch adds its rays to the normal equations of these motions, and every few steps they are solved
+(Gauss-Newton). No gradient with respect to positions is needed, so that any field and any sampler
+of rays will do.
+
+A motion of all cameras together, and a scale, can be undone by the field: they are removed. What
+remains is damped, and pulled towards the poses that were given, as the data are weak along some
+motions: a camera far away may come nearer without any change of its image.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor, distributed, nn
+
+from xplanes.rendering.base import Renderer, Rendering
+from xplanes.rendering.sampler import Group, Sampler
+from xplanes.scenes.batches import Batch
+from xplanes.scenes.frame import CameraGroups, Frame
+from xplanes.streams import TrainingState
+
+FIRST = 150
+"""Steps before the first correction, in which the field takes shape."""
+
+EVERY = 50
+"""Steps between corrections."""
+
+DAMPING, PULL = 0.01, 0.03
+"""Weights of a correction and of the distance from the given pose, beside the image's gradients."""
+
+LEAST_MOTION = 0.01
+"""Part of the mean weight of turns, or shifts, that directions without evidence have at least."""
+
+LARGEST = 1.0
+"""Largest correction at a time, in pixels."""
+
+LEAST_RAYS = 100.0
+"""Rays that a camera needs to be corrected, weighted by opacity."""
+
+BEHIND = 3.0
+"""Assumed distance of surroundings from the centre of the cube, in halves of its side."""
+
+
+class RefiningSampler(Sampler):
+    """Another sampler of rays, with poses that are corrected.
+
+    Args:
+        inner: The sampler.
+        groups: The training cameras.
+        scale: Batch size relative to the one that schedules assume.
+    """
+
+    def __init__(self, inner: Sampler, groups: CameraGroups, scale: float = 1.0) -> None:
+        self.inner, self.fill_seconds = inner, inner.fill_seconds
+        self.cameras = CameraCorrections(groups)
+        self.every, self.first = (max(1, round(count / scale)) for count in (EVERY, FIRST))
+        self._seen: Batch | None = None
+
+    @property
+    def renderer(self) -> Renderer:
+        return self.inner.renderer
+
+    @property
+    def parts(self) -> dict[str, nn.Module]:
+        return self.inner.parts | {"cameras": self.cameras}
+
+    @property
+    def outline(self) -> str:
+        return f"{self.inner.outline}, cameras refined".removeprefix(", ")
+
+    def groups(self) -> list[Group]:
+        return self.inner.groups()
+
+    @property
+    def pruned_at(self) -> int:
+        return self.inner.pruned_at
+
+    def first_rays(self, most: int) -> int:
+        return self.inner.first_rays(most)
+
+    def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
+        self._seen = self.cameras.corrected(rays)
+        return self.inner.render(field, self._seen, state)
+
+    def losses(self, rendering: Any) -> dict[str, Tensor]:
+        return self.inner.losses(rendering)
+
+    def regularise(self, field: Any, state: TrainingState) -> None:
+        self.inner.regularise(field, state)
+
+    def regularisers(self, field: Any, state: TrainingState) -> dict[str, float]:
+        return self.inner.regularisers(field, state)
+
+    def observe(self, rendering: Any) -> None:
+        assert self._seen is not None
+        self.cameras.observe(self._seen, rendering)
+        self._seen = None
+        self.inner.observe(rendering)
+
+    def update(self, field: Any, state: TrainingState) -> None:
+        self.inner.update(field, state)
+        done = state.step + 1
+        if done >= self.first and done % self.every == 0:
+            self.cameras.solve()
+        elif done < self.first:
+            self.cameras.forget()
+
+    def expect(self, samples: float) -> None:
+        self.inner.expect(samples)
+
+    def scalars(self) -> dict[str, float]:
+        moved = float(self.cameras.moved.mean())
+        return self.inner.scalars() | {"sampler/cameras_moved_px": moved}
+
+
+class CameraCorrections(nn.Module):
+    """A small turn and shift of each training camera, in the field's frame.
+
+    Args:
+        groups: The training cameras.
+
+    Attributes:
+        motion: Turn about the camera's own position, as a rotation vector, then shift. [C, 6]
+        moved: Root mean square displacement of what each camera sees, in pixels. [C]
+    """
+
+    index: Tensor
+    places: Tensor
+    motion: Tensor
+    moved: Tensor
+    steepness: Tensor
+    residual: Tensor
+    pixels: Tensor
+    rays: Tensor
+
+    def __init__(self, groups: CameraGroups) -> None:
+        super().__init__()
+        count, exact = len(groups.places), torch.float64
+        self.register_buffer("index", groups.index)
+        self.register_buffer("places", groups.places)
+        self.register_buffer("motion", torch.zeros(count, 6))
+        self.register_buffer("moved", torch.zeros(count))
+        # Sums over the rays since the last correction: squares of the derivatives of colours, their
+        # products with differences of colours, squares of displacements in pixels, and opacities.
+        self.register_buffer("steepness", torch.zeros(count, 6, 6, dtype=exact))
+        self.register_buffer("residual", torch.zeros(count, 6, dtype=exact))
+        self.register_buffer("pixels", torch.zeros(count, 6, 6, dtype=exact))
+        self.register_buffer("rays", torch.zeros(count, dtype=exact))
+
+    def corrected(self, rays: Batch) -> Batch:
+        """A batch with the rays of the corrected cameras.
+
+        Args:
+            rays: A batch with ``view`` and ``across`` (`RayBatches.slopes`).
+        """
+        camera = self.index[rays["view"]]
+        rotation = rotations(self.motion[:, :3])[camera]
+        return rays | {
+            "origins": rays["origins"] + self.motion[camera, 3:],
+            "directions": torch.einsum("rij,rj->ri", rotation, rays["directions"]),
+            "across": torch.einsum("rij,rkj->rki", rotation, rays["across"]),
+        }
+
+    @torch.no_grad()
+    def observe(self, rays: Batch, rendering: Rendering) -> None:
+        """Add the rays of a batch to the normal equations.
+
+        Args:
+            rays: The batch, with ``slopes``, as `corrected` returned it.
+            rendering: Its rendering.
+        """
+        origins, directions = rays["origins"], rays["directions"]
+        opacity = rendering.opacity.clamp(0, 1)
+        # The depth is a sum weighted by opacity.
+        near = opacity / rendering.depth.clamp(min=1e-3)
+        inverse = near + (1 - opacity) / (origins.norm(dim=-1) + BEHIND)
+        difference = rays["target"] - rendering.colour
+        usable = (difference.isfinite().all(dim=-1) & inverse.isfinite())[:, None]
+        difference = torch.where(usable, difference, 0)
+        inverse = torch.where(usable, inverse[:, None], 0)[:, None]
+        # Displacement in pixels, to the right and down, per change of direction: [R, 2, 3]. A turn
+        # w changes a direction d by w x d, and a shift s, seen at depth z, by s / z.
+        per_pixel = rays["across"]
+        to_pixels = torch.linalg.inv(per_pixel @ per_pixel.mT) @ per_pixel
+        turn = torch.linalg.cross(directions[:, None].expand_as(to_pixels), to_pixels)
+        displaced = torch.cat([turn, to_pixels * inverse], dim=-1)
+        slopes = rays["slopes"]
+        square = displaced.mT @ (slopes.mT @ slopes) @ displaced
+        product = (difference[:, None] @ slopes @ displaced)[:, 0]
+        camera = self.index[rays["view"]]
+        for sums, values in (
+            (self.steepness, square),
+            (self.residual, product),
+            (self.pixels, opacity[:, None, None] * (displaced.mT @ displaced)),
+            (self.rays, opacity),
+        ):
+            sums.index_add_(0, camera, values.double())
+
+    @torch.no_grad()
+    def solve(self) -> None:
+        """Correct the cameras by what was observed since the last time, and forget it."""
+        sums = (self.steepness, self.residual, self.pixels, self.rays)
+        if distributed.is_available() and distributed.is_initialized():
+            for each in sums:  # Each process has its own rays.
+                distributed.all_reduce(each)
+        count = self.rays.clamp(min=1e-9)[:, None]
+        steepness, residual = self.steepness / count[..., None], self.residual / count
+        metric = _floored(self.pixels / count[..., None])
+        known = self.rays >= LEAST_RAYS
+        # Mean square of the image's gradient, per square of a displacement in pixels.
+        gradient = (_trace(steepness) / _trace(metric).clamp(min=1e-30))[:, None]
+        motion = self.motion.double()
+        pull = PULL * gradient * (metric @ motion[..., None])[..., 0]
+        left = steepness + ((PULL + DAMPING) * gradient)[..., None] * metric
+        left[~known | (gradient[:, 0] <= 0)] = torch.eye(6, dtype=left.dtype, device=left.device)
+        step = torch.linalg.solve(left, (residual - pull)[..., None])[..., 0]
+        step *= (LARGEST / _displacement(step, metric).clamp(min=LARGEST))[:, None]
+        motion = torch.where(known[:, None], motion + step, motion)
+        motion = without_common(self.places.double(), motion, metric, known)
+        self.motion.copy_(motion)
+        self.moved.copy_(torch.where(known, _displacement(motion, metric), self.moved))
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin new sums."""
+        for sums in (self.steepness, self.residual, self.pixels, self.rays):
+            sums.zero_()
+
+    def poses(self, camera_to_world: Tensor, frame: Frame) -> Tensor:
+        """Corrected poses of the training views in the world. [V, 4, 4]
+
+        Args:
+            camera_to_world: The given poses. [V, 4, 4]
+            frame: The field's frame.
+        """
+        motion = self.motion.to(camera_to_world.device)[self.index.to(camera_to_world.device)]
+        turn = frame.rotation.T @ rotations(motion[:, :3]) @ frame.rotation
+        found = camera_to_world.clone()
+        found[:, :3, :3] = turn.to(found) @ camera_to_world[:, :3, :3]
+        found[:, :3, 3] += (motion[:, 3:] @ frame.rotation / frame.scale).to(found)
+        return found
+
+
+def rotations(vectors: Tensor) -> Tensor:
+    """Rotation matrices of rotation vectors. [N, 3] -> [N, 3, 3]"""
+    return torch.linalg.matrix_exp(_cross(vectors))
+
+
+def without_common(places: Tensor, motion: Tensor, metric: Tensor, known: Tensor) -> Tensor:
+    """Motions of cameras without what a motion and a scale of the whole scene would undo.
+
+    Args:
+        places: Positions of the cameras. [C, 3]
+        motion: Turn and shift of each. [C, 6]
+        metric: Square of the displacement in pixels, as a quadratic form of a motion. [C, 6, 6]
+        known: Cameras that count. bool [C]
+
+    Returns:
+        The smallest motions that differ by a common one; others as they were. [C, 6]
+    """
+    if not known.any():
+        return motion
+    # A common turn w, shift s and growth g turn a camera at o by w and move it by w x o + s + g o.
+    eye = torch.eye(3, dtype=motion.dtype, device=motion.device).expand(len(places), 3, 3)
+    zero = torch.zeros_like(eye)
+    turned = torch.cat([eye, zero, zero[..., :1]], dim=2)
+    shifted = torch.cat([-_cross(places), eye, places[..., None]], dim=2)
+    common = torch.cat([turned, shifted], dim=1)
+    weighted = common[known].mT @ metric[known]
+    left, right = weighted @ common[known], weighted @ motion[known, :, None]
+    found = torch.linalg.lstsq(left.sum(dim=0), right.sum(dim=0)).solution
+    return torch.where(known[:, None], motion - (common @ found)[..., 0], motion)
+
+
+def _cross(vectors: Tensor) -> Tensor:
+    """Matrices of cross products with vectors. [N, 3] -> [N, 3, 3]"""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(-1, 3, 3)
+
+
+def _floored(metric: Tensor) -> Tensor:
+    """A quadratic form of turn and shift with a least weight of every direction. [C, 6, 6]"""
+    weights = metric.diagonal(dim1=1, dim2=2).view(-1, 2, 3).mean(dim=-1)
+    least = (LEAST_MOTION * weights).clamp(min=1e-12).repeat_interleave(3, dim=1)
+    return metric + torch.diag_embed(least)
+
+
+def _trace(form: Tensor) -> Tensor:
+    return form.diagonal(dim1=1, dim2=2).sum(dim=-1)
+
+
+def _displacement(motion: Tensor, metric: Tensor) -> Tensor:
+    """Root mean square displacement in pixels. [C, 6] -> [C]"""
+    return (motion[:, None] @ metric @ motion[..., None])[:, 0, 0].clamp(min=0).sqrt()

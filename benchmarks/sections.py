@@ -319,7 +319,9 @@ def why_stale(section: Section) -> str:
             continue
         then = record["settings"][case]
         for key in sorted({*then, *settings}):
-            if (old := then.get(key)) != (new := settings.get(key)):
+            old, new = then.get(key), settings.get(key)
+            # A setting that did not exist, and is off now, changes nothing.
+            if old != new and (key in then or new is not False):
                 changes.setdefault(f"{key} went from {old} to {new}", []).append(case)
     for words, cases in list(changes.items()):
         if len(cases) == 1 < len(now):

@@ -57,6 +57,11 @@ def test_a_record_is_stale_when_settings_of_what_it_measured_have_changed(record
     new = {"one": {**case, "model.loss.opacity": 0.2}, "two": old.settings()["two"], "three": case}
     words = records.why_stale(section(records, new, rows))
     assert words == "three has not been measured, model.loss.opacity went from 0.1 to 0.2 (one)"
+    # A setting that is new: what it was then is what it is when it is off.
+    off = {name: {**case, "data.new": False} for name, case in old.settings().items()}
+    assert records.why_stale(section(records, off, rows)) == ""
+    on = {name: {**case, "data.new": True} for name, case in old.settings().items()}
+    assert records.why_stale(section(records, on, rows)) == "data.new went from None to True"
     records.write_record("some", {"version": "1"}, {}, rows)
     assert "version 1" in records.why_stale(old)
 

@@ -42,9 +42,12 @@ def test_numbers_are_even_and_independent():
     assert torch.stack([found.flatten(), following.flatten()]).corrcoef()[0, 1].abs() < 0.02
 
 
+@pytest.mark.parametrize("slopes", [False, True])
 @pytest.mark.parametrize("background", ["white", "random", "one"])
-def test_batches_have_the_same_bits_on_every_device(fake_gpu, background):
+def test_batches_have_the_same_bits_on_every_device(fake_gpu, background, slopes):
     batches = batches_of(background=background, background_jitter=0.1, seed=2, rank=1)
+    if slopes:
+        batches.add_slopes()
     here, there = DeviceBatches(batches, CPU), DeviceBatches(batches, fake_gpu)
     for step in (0, 7, 10**9):
         with fake_device.counted() as counts:

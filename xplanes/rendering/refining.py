@@ -272,7 +272,8 @@ def without_common(places: Tensor, motion: Tensor, metric: Tensor, known: Tensor
     common = torch.cat([turned, shifted], dim=1)
     weighted = common[known].mT @ metric[known]
     left, right = weighted @ common[known], weighted @ motion[known, :, None]
-    found = torch.linalg.lstsq(left.sum(dim=0), right.sum(dim=0)).solution
+    # Few cameras do not determine all of it.
+    found = torch.linalg.pinv(left.sum(dim=0), hermitian=True) @ right.sum(dim=0)
     return torch.where(known[:, None], motion - (common @ found)[..., 0], motion)
 
 

@@ -361,7 +361,7 @@ class RayBatches(Batches):
         )
         around = images[view[:, None, None], rows[:, :, None], columns[:, None]].float() / 255
         step = offsets / (2 * SLOPES_OVER**2)
-        smooth = torch.tensor([0.25, 0.5, 0.25], device=view.device)
+        smooth = 0.5 - offsets.abs() / (4 * SLOPES_OVER)  # A quarter, a half and a quarter.
         kernels = torch.stack([torch.outer(smooth, step), torch.outer(step, smooth)])
         slopes = torch.einsum("rijc,kij->rck", around, kernels)
         # Images are stored multiplied by alpha.

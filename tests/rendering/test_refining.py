@@ -150,6 +150,25 @@ def test_exact_cameras_stay_and_a_fixed_camera_has_one_pose():
     assert cameras.moved.max() < 0.05
 
 
+def test_corrections_are_the_same_on_a_gpu(fake_gpu):
+    truth = surrounding(6, 4.0)
+    views = replace(views_of(truth), camera_to_world=disturbed(truth, 1.0))
+    found = []
+    for device in (torch.device("cpu"), fake_gpu):
+        cameras = CameraCorrections(CameraGroups.of(views, FRAME)).to(device)
+        for step in range(4):
+            drawn = batches_of(views).draw(step)
+            rays = cameras.corrected({name: value.to(device) for name, value in drawn.items()})
+            seen = (
+                part.to(device) for part in ball(rays["origins"].cpu(), rays["directions"].cpu())
+            )
+            cameras.observe(rays, Rendering(*seen, torch.empty(0), None))  # pyright: ignore
+        cameras.solve()
+        found.append(cameras.motion.cpu())
+    assert found[0].abs().max() > 1e-3
+    assert torch.allclose(found[0], found[1], atol=1e-6)
+
+
 def test_what_the_field_can_undo_is_removed():
     generator = torch.Generator().manual_seed(1)
     places = torch.randn(6, 3, generator=generator, dtype=torch.float64)

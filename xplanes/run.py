@@ -202,9 +202,9 @@ def train(
 
     # Training
     if record is not None:
-        name = torch.cuda.get_device_name() if device.type == "cuda" else "cpu"
+        hardware = torch.cuda.get_device_name() if device.type == "cuda" else "cpu"
         files = {name: list(views.files) for name, views in scene.splits.items()}
-        record.note(device=name, precision=module.field.precision, files=files)
+        record.note(device=hardware, precision=module.field.precision, files=files)
         warm_up_loops(module, data, device)
         expected = estimate(module, data)
         text = header(experiment, folder, data, module, overrides, expected, record.seconds)

@@ -195,8 +195,11 @@ def test_rays_that_say_nothing_move_nothing():
     cameras = CameraCorrections(CameraGroups.of(views, FRAME))
     rays = batches_of(views).draw(0)
     blank = torch.zeros(len(rays["times"]))
-    for colour in (torch.full_like(rays["target"], torch.nan), rays["target"]):
-        cameras.observe(rays, Rendering(colour, blank, blank, blank, None))  # pyright: ignore
+    wrong = torch.full_like(rays["target"], torch.nan)
+    # Pixels of a fisheye lens beside the last one with a ray.
+    same = rays | {"across": torch.zeros_like(rays["across"])}
+    for drawn, colour in ((rays, wrong), (rays, rays["target"]), (same, rays["target"] / 2)):
+        cameras.observe(drawn, Rendering(colour, blank, blank, blank, None))  # pyright: ignore
         cameras.solve()
         assert torch.equal(cameras.motion, torch.zeros(4, 6))
         assert torch.equal(cameras.steepness, torch.zeros(4, 6, 6).double())

@@ -41,6 +41,9 @@ LARGEST = 1.0
 LEAST_RAYS = 100.0
 """Rays that a camera needs to be corrected, weighted by opacity."""
 
+LEAST_AREA = 1e-3
+"""Least square of the sine between the changes of a direction by a pixel to the right and down."""
+
 BEHIND = 3.0
 """Assumed distance of surroundings from the centre of the cube, in halves of its side."""
 
@@ -83,8 +86,9 @@ class RefiningSampler(Sampler):
         return self.inner.first_rays(most)
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
-        self._seen = self.cameras.corrected(rays)
-        return self.inner.render(field, self._seen, state)
+        rays = self.cameras.corrected(rays)
+        self._seen = rays if state.step >= self.first - self.every else None
+        return self.inner.render(field, rays, state)
 
     def losses(self, rendering: Any) -> dict[str, Tensor]:
         return self.inner.losses(rendering)
@@ -96,9 +100,9 @@ class RefiningSampler(Sampler):
         return self.inner.regularisers(field, state)
 
     def observe(self, rendering: Any) -> None:
-        assert self._seen is not None
-        self.cameras.observe(self._seen, rendering)
-        self._seen = None
+        if self._seen is not None:
+            self.cameras.observe(self._seen, rendering)
+            self._seen = None
         self.inner.observe(rendering)
 
     def update(self, field: Any, state: TrainingState) -> None:
@@ -106,8 +110,6 @@ class RefiningSampler(Sampler):
         done = state.step + 1
         if done >= self.first and done % self.every == 0:
             self.cameras.solve()
-        elif done < self.first:
-            self.cameras.forget()
 
     def expect(self, samples: float) -> None:
         self.inner.expect(samples)
@@ -140,8 +142,9 @@ class CameraCorrections(nn.Module):
     def __init__(self, groups: CameraGroups) -> None:
         super().__init__()
         count, exact = len(groups.places), torch.float64
-        self.register_buffer("index", groups.index)
-        self.register_buffer("places", groups.places)
+        # Known wherever the field is built.
+        self.register_buffer("index", groups.index, persistent=False)
+        self.register_buffer("places", groups.places, persistent=False)
         self.register_buffer("motion", torch.zeros(count, 6))
         self.register_buffer("moved", torch.zeros(count))
         # Sums over the rays since the last correction: squares of the derivatives of colours, their
@@ -179,22 +182,30 @@ class CameraCorrections(nn.Module):
         near = opacity / rendering.depth.clamp(min=1e-3)
         inverse = near + (1 - opacity) / (origins.norm(dim=-1) + BEHIND)
         difference = rays["target"] - rendering.colour
+        # Displacement in pixels, to the right and down, per change of direction: the inverse of
+        # the changes of direction per pixel, within their plane. [R, 2, 3]
+        right, down = rays["across"].unbind(dim=1)
+        across, both, along = (
+            (first * second).sum(dim=-1, keepdim=True)
+            for first, second in ((right, right), (right, down), (down, down))
+        )
+        area = across * along - both.square()
+        to_pixels = torch.stack([along * right - both * down, across * down - both * right], dim=1)
+        to_pixels /= area[..., None]
+        # A lens may map no direction to the next pixel, and a field may fail.
         usable = (difference.isfinite().all(dim=-1) & inverse.isfinite())[:, None]
+        usable &= area > LEAST_AREA * across * along
         difference = torch.where(usable, difference, 0)
         inverse = torch.where(usable, inverse[:, None], 0)[:, None]
-        # Displacement in pixels, to the right and down, per change of direction: [R, 2, 3]. A turn
-        # w changes a direction d by w x d, and a shift s, seen at depth z, by s / z.
-        per_pixel = rays["across"]
-        to_pixels = torch.linalg.inv(per_pixel @ per_pixel.mT) @ per_pixel
+        to_pixels = torch.where(usable[:, None], to_pixels, 0)
+        # A turn w changes a direction d by w x d, and a shift s, seen at depth z, by s / z.
         turn = torch.linalg.cross(directions[:, None].expand_as(to_pixels), to_pixels)
         displaced = torch.cat([turn, to_pixels * inverse], dim=-1)
-        slopes = rays["slopes"]
-        square = displaced.mT @ (slopes.mT @ slopes) @ displaced
-        product = (difference[:, None] @ slopes @ displaced)[:, 0]
+        change = rays["slopes"] @ displaced  # Of the colour, by each component of a motion.
         camera = self.index[rays["view"]]
         for sums, values in (
-            (self.steepness, square),
-            (self.residual, product),
+            (self.steepness, change.mT @ change),
+            (self.residual, (difference[:, None] @ change)[:, 0]),
             (self.pixels, opacity[:, None, None] * (displaced.mT @ displaced)),
             (self.rays, opacity),
         ):
@@ -223,12 +234,8 @@ class CameraCorrections(nn.Module):
         motion = without_common(self.places.double(), motion, metric, known)
         self.motion.copy_(motion)
         self.moved.copy_(torch.where(known, _displacement(motion, metric), self.moved))
-        self.forget()
-
-    def forget(self) -> None:
-        """Begin new sums."""
-        for sums in (self.steepness, self.residual, self.pixels, self.rays):
-            sums.zero_()
+        for each in sums:
+            each.zero_()
 
     def poses(self, camera_to_world: Tensor, frame: Frame) -> Tensor:
         """Corrected poses of the training views in the world. [V, 4, 4]

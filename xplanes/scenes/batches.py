@@ -335,7 +335,7 @@ class RayBatches(Batches):
         origins, directions = self.views.pixel_rays(view, row.float(), column.float())
         origins, directions = self.frame.rays(origins, directions)
         colour = colour.float() / 255
-        more = self._slopes(view, row, column, background) if self.slopes else {}
+        more = self._slopes(directions, view, row, column, background) if self.slopes else {}
         return more | {
             "origins": origins,
             "directions": directions,
@@ -346,20 +346,21 @@ class RayBatches(Batches):
             "jitter": jitter,
         }
 
-    def _slopes(self, view: Tensor, row: Tensor, column: Tensor, background: Tensor) -> Batch:
-        """What `slopes` adds to a batch of drawn pixels."""
-        places = (row, column), (row, column + 1), (row + 1, column)
-        ray, *others = (self.views.pixel_rays(view, *(x.float() for x in at))[1] for at in places)
-        across = torch.stack([turned(other - ray, self.frame.rotation) for other in others], dim=1)
+    def _slopes(
+        self, directions: Tensor, view: Tensor, row: Tensor, column: Tensor, background: Tensor
+    ) -> Batch:
+        """What `slopes` adds to a batch of drawn pixels with these directions."""
+        places = (row, column + 1), (row + 1, column)
+        rays = (self.views.pixel_rays(view, *(x.float() for x in place))[1] for place in places)
+        across = torch.stack([turned(ray, self.frame.rotation) - directions for ray in rays], dim=1)
         images = self.views.images
         assert isinstance(images, Tensor)
-        last = self.views.intrinsics.size.to(view.device)[view] - 1
         offsets = torch.arange(-SLOPES_OVER, SLOPES_OVER + 1, SLOPES_OVER, device=view.device)
-        rows, columns = (
-            torch.minimum((at[:, None] + offsets).clamp(min=0), last[:, k, None])
-            for k, at in enumerate((row, column))
-        )
-        around = images[view[:, None, None], rows[:, :, None], columns[:, None]].float() / 255
+        last = self.views.intrinsics.size[view] - 1
+        rows = torch.minimum((row[:, None] + offsets).clamp(min=0), last[:, :1])
+        columns = torch.minimum((column[:, None] + offsets).clamp(min=0), last[:, 1:])
+        lines = (view[:, None] * images.shape[1] + rows) * images.shape[2]
+        around = images.view(-1, 4)[lines[:, :, None] + columns[:, None]].float() / 255
         step = offsets / (2 * SLOPES_OVER**2)
         smooth = 0.5 - offsets.abs() / (4 * SLOPES_OVER)  # A quarter, a half and a quarter.
         kernels = torch.stack([torch.outer(smooth, step), torch.outer(step, smooth)])

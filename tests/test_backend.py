@@ -112,6 +112,7 @@ def python(*arguments: str, **options) -> subprocess.CompletedProcess:
     return done
 
 
+@pytest.mark.slow
 def test_loops_run_where_numba_can_keep_nothing(sealed, tmp_path):
     package, environment = sealed
     done = python("-c", SEALED, str(package), cwd=tmp_path, env=environment)
@@ -136,6 +137,7 @@ def test_a_run_needs_no_folder_but_its_own(sealed, tmp_path):
         assert path.is_relative_to(place / "run") or path.is_relative_to(data), path
 
 
+@pytest.mark.slow
 def test_loops_are_kept_where_they_can_be(sealed, tmp_path):
     package, environment = sealed
     environment |= {"NUMBA_CACHE_DIR": str(tmp_path / "kept")}

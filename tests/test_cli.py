@@ -2,19 +2,20 @@
 
 import json
 import sys
+from pathlib import Path
 
 import pytest
 
-from tests import warm
+from tests import inside
+from xplanes import cli
 from xplanes.baselines.gaussians.rasteriser import GaussianError
 from xplanes.cli import main
 from xplanes.errors import DeviceError
 
 
 def test_evaluate_as_a_program(trained_run, tmp_path):
-    done = warm.run(
-        *("-m", "xplanes", "evaluate", str(trained_run), "--lpips", "none"), cwd=tmp_path
-    )
+    program = str(Path(cli.__file__).with_name("__main__.py"))
+    done = inside.run(program, "evaluate", str(trained_run), "--lpips", "none", cwd=tmp_path)
     lines = done.stdout.splitlines()
     assert lines[0] == f"run         {trained_run}"
     assert lines[1].startswith("checkpoint  last.ckpt, step 40")

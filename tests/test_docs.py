@@ -54,6 +54,7 @@ def test_addresses_and_version_are_the_same_wherever_they_stand():
     assert cited["version"] == __version__
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not find_spec("mkdocs"), reason="the site needs the extra docs")
 def test_the_site_builds_without_a_warning(tmp_path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]

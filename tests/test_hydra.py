@@ -26,24 +26,18 @@ from xplanes.training.module import RadianceModule
 
 NEAR = {
     "trainer.max_second=3": "trainer.max_seconds or trainer.max_steps",
-    "trainer.max_step=10": "trainer.max_steps or trainer.max_seconds",
     "max_seconds=3": "trainer.max_seconds",
-    "max_steps=3": "trainer.max_steps",
     "schedule.max_seconds=3": "trainer.max_seconds",  # It belongs to pretrain_lrm.
     "model=kplanes model.learning_rat=3": "model.learning_rate",
     "data=colmap data.test_camera=3": "data.test_cameras",
-    "data.resolutoin=3": "data.resolution",
     "model.resolutoin=64": "model.resolution or model.time_resolution",
-    "model.decoder.widht=3": "model.decoder.width or model.decoder.hidden or model.decoder.density",
     "model.sampler.sampels=3": "model.sampler.samples or model.sampler.name or "
     "model.sampler.render_samples",
     "sampler.samples=3": "model.sampler.samples or model.background.samples",
     "trainer.plane_lr=3": "model.plane_lr or model.background.plane_lr",
     "callback=threads": "callbacks",
     "recpe=paper": "recipe",
-    "modle=six_planes": "model",
     "model=six_plane": "model=six_planes",
-    "data=demos": "data=demo",
     "model/sampler=ocupancy": "model/sampler=occupancy",
 }
 """What is typed, and the whole suggestion; nothing that the run does not have is suggested."""

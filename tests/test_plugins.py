@@ -171,9 +171,11 @@ def example(
                 "plugins=[my_package]",
                 f"{group}={name}",
                 f"data.root={scenes}",
-                "data.train_views=8",
-                "data.test_views=2",
+                "data.resolution=32",
+                "data.train_views=10",
+                "data.test_views=3",
                 "data.val_views=2",
+                "model.rays.per_batch=256",
                 "model.sampler.grid_resolution=24",
                 "trainer.accelerator=cpu",
                 "trainer.max_seconds=null",
@@ -191,7 +193,7 @@ def example(
 @pytest.fixture
 def small_model(example: Callable[..., dict]) -> dict:
     """The configuration of the docs' model."""
-    return example("A model", "model", "mlp", "data.resolution=24", "trainer.max_steps=60")
+    return example("A model", "model", "mlp", "trainer.max_steps=60")
 
 
 def first_psnr(folder: Path) -> float:
@@ -200,8 +202,7 @@ def first_psnr(folder: Path) -> float:
 
 
 def test_the_lrm_of_the_docs_initialises_a_field(example, tmp_path):
-    changes = ("data.resolution=48", "preparation.cache=null", "preparation.frames=4")
-    changes += ("trainer.max_steps=2",)
+    changes = ("preparation.cache=null", "preparation.frames=4", "trainer.max_steps=2")
     own = example("A Large Reconstruction Model", "lrm", "cardboard", *changes)
     run(own, tmp_path / "own", [], resume=False)
     content = metrics(tmp_path / "own")

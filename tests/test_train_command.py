@@ -26,6 +26,7 @@ from xplanes.components import build
 from xplanes.config import CONF, compose_plain, quoted, unquoted, with_names
 from xplanes.errors import ConfigError
 from xplanes.launch import SettingsCheck, prepare
+from xplanes.locks import alone_in, in_turn
 from xplanes.process import resume_command
 from xplanes.scenes.colmap import ColmapSettings
 
@@ -268,7 +269,7 @@ def test_home_is_expanded(monkeypatch, tmp_path: Path) -> None:
 
 def test_piped_output_is_plain_and_ends_with_scores_and_paths(root: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    result = train(root, *SMALL, "trainer.max_steps=5", f"hydra.run.dir={run}")
+    result = inside.train(root, *SMALL, "trainer.max_steps=5", f"hydra.run.dir={run}")
     assert "\x1b" not in result.stdout
     assert "\r" not in result.stdout
     tail = result.stdout.split("step 5/5")[-1]
@@ -380,13 +381,24 @@ def start(run: Path, root: str) -> warm.Running:
     )
 
 
-def test_ctrl_c_saves_and_says_how_to_go_on(root: str, tmp_path: Path) -> None:
+def test_a_run_is_alone_in_its_folder_and_ctrl_c_saves_it(root: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     process = start(run, root)
     warm.wait_for(run / "checkpoints" / "last.ckpt", process)
+    with pytest.raises(ConfigError, match=f"in use by process {process.pid}: wait"):
+        alone_in(run).__enter__()
     process.send_signal(signal.SIGINT)
     assert process.wait(60) == 130
     assert '"status": "interrupted"' in (run / "run.json").read_text()
+    with alone_in(run):
+        assert (run / ".lock").is_file()
+
+
+def test_turns_are_free_when_nobody_holds_them(tmp_path: Path) -> None:
+    with in_turn(tmp_path / "a.lock") as waited:
+        assert not waited
+    with in_turn(None) as waited:
+        assert not waited
 
 
 @pytest.mark.slow

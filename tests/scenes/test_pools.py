@@ -92,6 +92,7 @@ print((peak() - before) / views.nbytes)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs Linux's /proc")
 def test_drawing_is_prepared_in_little_more_memory_than_the_images_take():
     call = [sys.executable, "-c", GROWTH]

@@ -1,5 +1,6 @@
 """Controls of the LRM: what each exchanges, and what it leaves alone."""
 
+import functools
 import importlib
 import sys
 from collections.abc import Callable, Iterator
@@ -34,8 +35,9 @@ def controls() -> Iterator:
 
 @pytest.fixture(scope="module")
 def make(controls, scenes: Path) -> Make:
-    """A field of 24 texels from `tiny`, with a control or none."""
+    """A field of 24 texels from `tiny`, with a control or none; not to be changed."""
 
+    @functools.cache
     def make(
         control: str | None, file: Path | None = None
     ) -> tuple[Initialisation, RadianceModule]:

@@ -590,23 +590,6 @@ def test_the_composed_configuration_survives_its_file():
 
 
 @pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("model.resolution=big", r"^model\.resolution=big: must be a whole number"),
-        ("media=perhaps", r"^media=perhaps"),
-        ("trainer.max_seconds=soon", r"^trainer\.max_seconds=soon"),
-        ("seed=null", r"^seed=None"),
-        ("model.colour=3", r"model\.colour"),
-        ("trainer.max_step=3", r"trainer\.max_step\b"),
-        ("sed=1", r"\bsed\b"),
-    ],
-)
-def test_values_of_another_type_and_unknown_keys_are_refused(override, words, tmp_path):
-    with pytest.raises(ConfigError, match=words):
-        Experiment.read(compose_plain("train", [override])).build_trainer(tmp_path)
-
-
-@pytest.mark.parametrize(
     "arguments",
     [
         [],

@@ -27,14 +27,8 @@ MODELS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "gaussians_hexplane",
-        pytest.param("gaussians_deform", marks=pytest.mark.slow),
-        pytest.param("gaussians_spacetime", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MODELS)
 def test_run_learns_grows_resumes_and_is_loaded(scenes, tmp_path, monkeypatch, name):
     cache = f"preparation.cache={tmp_path}/cache"
     config = baseline_config(scenes, f"model={name}", *SMALL, *MODELS[name], cache)

@@ -7,12 +7,7 @@ import torch
 
 from tests.balls import ball_scene, ball_views
 from tests.baselines.checks import check_learns, check_refused, check_reload, check_resume
-from tests.baselines.runs import (
-    KPLANES,
-    OCCUPANCY,
-    PROPOSAL,
-    baseline_config,
-)
+from tests.baselines.runs import KPLANES, OCCUPANCY, PROPOSAL, baseline_config
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.models.initialisation import Method
@@ -31,23 +26,20 @@ def test_hybrid_run_learns_resumes_and_is_loaded(scenes, tmp_path, monkeypatch):
     assert set(trained.module.state_dict()) >= {"proposals.0.products.scales.0.xy"}
 
 
+OTHERS = {
+    "grid of cells": ("model=kplanes", "model/sampler=occupancy", *FAST, *OCCUPANCY),
+    "X-Planes": (
+        *("model/sampler=proposal", "model.resolution=16", "model.channels=4", *PROPOSAL),
+        *("model.rays.per_batch=128", "trainer.max_steps=20"),
+    ),
+}
+
+
 @pytest.mark.parametrize(
-    "overrides",
-    [
-        ("model=kplanes", "model/sampler=occupancy", *FAST, *OCCUPANCY, "trainer.max_steps=60"),
-        (
-            "model/sampler=proposal",
-            "model.resolution=16",
-            "model.channels=4",
-            *PROPOSAL,
-            "model.rays.per_batch=128",
-            "trainer.max_steps=20",
-        ),
-    ],
-    ids=["grid of cells", "X-Planes"],
+    "name", [pytest.param("grid of cells", marks=pytest.mark.slow), "X-Planes"]
 )
-def test_others_learn(scenes, tmp_path, overrides):
-    config = baseline_config(scenes, "trainer.max_steps=30", *overrides)
+def test_others_learn(scenes, tmp_path, name):
+    config = baseline_config(scenes, "trainer.max_steps=60", *OTHERS[name])
     check_learns(config, tmp_path / "run", gain=2)
 
 

@@ -1,6 +1,7 @@
 """Gaussian splatting: values and gradients against the formulas, and what is at the edges."""
 
 import dataclasses
+import functools
 import sys
 
 import numpy as np
@@ -50,7 +51,7 @@ def at_float32(given):
     return [t.float().double() for t in given]
 
 
-@pytest.fixture(params=KINDS)
+@pytest.fixture(params=("loops", "float64"))
 def kind(request, monkeypatch):
     monkeypatch.setenv("XPLANES_CPU_LOOPS", str(int(request.param == "loops")))
     return request.param
@@ -75,17 +76,18 @@ def close(ours, theirs, most):
         assert worst <= most, f"error {worst:.1e} of {scale:.1e}"
 
 
-def upstream(image):
+def upstream(*outputs):
+    """Gradients of colour, opacity and depth, the same for the same sizes."""
     draw = torch.Generator().manual_seed(5)
-    outputs = (image.colour, image.opacity, image.depth)
     return [torch.randn(t.shape, generator=draw, dtype=torch.float64) for t in outputs]
 
 
-def back(image, weights):
+def back(image):
     outputs = (image.colour, image.opacity, image.depth)
-    sum((t * w.to(t)).sum() for t, w in zip(outputs, weights, strict=True)).backward()
+    sum((t * w.to(t)).sum() for t, w in zip(outputs, upstream(*outputs), strict=True)).backward()
 
 
+@pytest.mark.parametrize("kind", KINDS, indirect=True)
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_images_are_those_of_the_formulas(kind, antialiased):
     # Several tiles, Gaussians across their edges and beyond the image's, behind, and too near.
@@ -102,28 +104,41 @@ def test_images_are_those_of_the_formulas(kind, antialiased):
         assert 0 < (image.radii > 0).sum() < 60
 
 
+def few(channels):
+    """Some Gaussians, and the background behind them."""
+    given = at_float32(gaussians(5, seed=3, channels=channels, size=0.3))
+    return given, torch.linspace(0.2, 1, channels, dtype=torch.float64)
+
+
+@functools.cache
+def slopes_of(channels, antialiased):
+    """Slopes of the formulas by each number of a few Gaussians, and by the principal point."""
+    given, background = few(channels)
+    camera, arrays = camera_of(), [t.numpy() for t in given]
+
+    def loss(*arrays, camera=camera):
+        outputs = [
+            torch.as_tensor(t) for t in oracle.splat(arrays, camera, background, antialiased)
+        ]
+        return sum(float((w * t).sum()) for w, t in zip(upstream(*outputs), outputs, strict=True))
+
+    def moved(centre):
+        return loss(*arrays, camera=dataclasses.replace(camera, cx=centre[0], cy=centre[1]))
+
+    return oracle.slopes(loss, arrays), *oracle.slopes(moved, [np.array([camera.cx, camera.cy])])
+
+
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gradients_are_slopes_of_the_formulas(kind, antialiased):
     for channels in (3, 5):
-        given = at_float32(gaussians(5, seed=3, channels=channels, size=0.3))
-        camera, background = camera_of(), torch.linspace(0.2, 1, channels, dtype=torch.float64)
-        image, ours = drawn(kind, given, camera, background=background, antialiased=antialiased)
-        weights = upstream(image)
-        back(image, weights)
-
-        def loss(*arrays, camera=camera, weights=weights, background=background):
-            outputs = oracle.splat(arrays, camera, background, antialiased)
-            return sum((w.numpy() * t).sum() for w, t in zip(weights, outputs, strict=True))
-
-        arrays = [t.numpy() for t in given]
-        for tensor, theirs in zip(ours, oracle.slopes(loss, arrays), strict=True):
+        given, background = few(channels)
+        options = {"background": background, "antialiased": antialiased}
+        image, ours = drawn(kind, given, camera_of(), **options)
+        back(image)
+        expected, shift = slopes_of(channels, antialiased)
+        for tensor, theirs in zip(ours, expected, strict=True):
             close(tensor.grad, theirs, 2e-5 if kind != "float64" else 1e-6)
-
-        def moved(centre, arrays=arrays, loss=loss, camera=camera):
-            return loss(*arrays, camera=dataclasses.replace(camera, cx=centre[0], cy=centre[1]))
-
         # Moving the principal point moves all projected means alike, and nothing else.
-        (shift,) = oracle.slopes(moved, [np.array([camera.cx, camera.cy])])
         close(image.means2d.grad.sum(0), shift, 2e-5)
 
 
@@ -134,7 +149,7 @@ def test_loops_and_plain_torch_agree_on_many_gaussians(monkeypatch):
         monkeypatch.setenv("XPLANES_CPU_LOOPS", str(int(kind == "loops")))
         given = at_float32(gaussians(1500, size=0.04))
         image, leaves = drawn(kind, given, camera, background=torch.ones(3))
-        back(image, upstream(image))
+        back(image)
         gradients = [image.means2d.grad, *(t.grad for t in leaves)]
         found.append([image.colour, image.opacity, image.depth, image.radii, *gradients])
     for ours, theirs in zip(*found, strict=True):
@@ -147,7 +162,7 @@ def test_the_same_bits_on_any_number_of_threads(monkeypatch):
     for count in (1, 2, 2):
         with threads(count):
             image, given = drawn("loops", gaussians(800, size=0.05), camera_of(100, 80))
-            back(image, upstream(image))
+            back(image)
         tensors = (image.colour, image.opacity, image.depth, image.means2d.grad)
         found.append([*tensors, *(t.grad for t in given)])
     for first, *others in zip(*found, strict=True):
@@ -184,7 +199,7 @@ def test_points_needles_discs_and_giants(kind, scale):
         most = max(TOLERANCE[kind], 1e-6 if antialiased else 0)
         close(image.opacity, expected[1], most)
         close(image.colour, expected[0], most)
-        back(image, upstream(image))
+        back(image)
         for leaf in leaves:
             assert leaf.grad.isfinite().all()
 
@@ -198,7 +213,7 @@ def test_thousands_of_layers_stop_at_the_cut_off(kind):
     close(image.opacity, expected[1], 10 * TOLERANCE[kind])
     close(image.colour, expected[0], 10 * TOLERANCE[kind])
     assert (1 - image.opacity > 0.9e-4).all()
-    back(image, upstream(image))
+    back(image)
     # Behind the cut-off nothing is seen, and nothing is learnt.
     assert (leaves[4].grad[-500:] == 0).all()
     assert (leaves[4].grad[:500] != 0).all()
@@ -231,9 +246,9 @@ def test_what_is_not_seen_changes_nothing(kind, change):
     seen = single(camera)
     both = [torch.cat(pair) for pair in zip(seen, single(camera, **change), strict=True)]
     alone, given = drawn(kind, seen, camera)
-    back(alone, upstream(alone))
+    back(alone)
     image, leaves = drawn(kind, both, camera)
-    back(image, upstream(image))
+    back(image)
     assert torch.equal(alone.colour, image.colour)
     assert image.radii.tolist() == [*alone.radii.tolist(), 0]
     for leaf, lone in zip(leaves, given, strict=True):
@@ -313,7 +328,7 @@ def test_gsplat_draws_what_plain_torch_draws(antialiased):
         leaves = [t.to(device, dtype).requires_grad_() for t in given]
         image = rasterise(*leaves, camera, antialiased=antialiased)
         image.means2d.retain_grad()
-        back(image, upstream(image))
+        back(image)
         tensors = (image.colour, image.opacity, image.depth, image.means2d.grad)
         found.append([t.detach().cpu() for t in (*tensors, *(t.grad for t in leaves))])
     for ours, theirs in zip(*found, strict=True):

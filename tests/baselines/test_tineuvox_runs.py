@@ -13,6 +13,7 @@ from xplanes.rendering.sampler import Site
 FAST = ("model.network_learning_rate=0.004", "trainer.max_steps=34")
 
 
+@pytest.mark.slow
 def test_run_learns_grows_resumes_and_is_loaded(scenes, tmp_path, monkeypatch):
     config = baseline_config(scenes, "model=tineuvox_s", *TINEUVOX, *FAST)
     folder = check_learns(config, tmp_path / "whole", gain=3)

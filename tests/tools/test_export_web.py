@@ -177,6 +177,7 @@ def ball_on(page: Any) -> tuple[float, float, np.ndarray]:
     return rows.mean(), columns.mean(), halves[0] - halves[1]
 
 
+@pytest.mark.slow
 @needs_browser
 def test_a_browser_plays_the_page(tmp_path):
     """The ball moves along y, here to the right, and is bluer above: its colour tells z."""

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from tests.training.runs import small_config
@@ -14,6 +15,7 @@ BOUND = 0.05
 """In dB."""
 
 
+@pytest.mark.slow
 def test_a_saving_costs_less_than_its_bound(scenes, tmp_path):
     # Outside the silhouettes the field keeps its initial values.
     config = small_config(

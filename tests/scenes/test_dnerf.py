@@ -195,6 +195,48 @@ def test_frames_without_times_do_not_pass_for_those_of_time_zero(tmp_path):
         assert scene.read(splits=splits).splits["train"].is_static, split
 
 
+@pytest.mark.parametrize(
+    ("write", "found"),
+    [
+        (lambda time: {"time": round(40 * time)}, lambda time: time),
+        (lambda time: {"time": 2 * time - 1}, lambda time: time),
+        (lambda time: {"timestamp": 1000 + 3 * time}, lambda time: time),
+        (lambda time: {"time": 1.25 * time}, lambda time: time),
+        (lambda time: {"time": 0.5 * time}, lambda time: 0.5 * time),
+    ],
+)
+def test_times_of_all_splits_are_mapped_together(tmp_path, write, found):
+    scene = SceneFolder(tmp_path / "ball").add("train", 5).add("val", 3).add("test", 2)
+    for split, times in (("train", [0, 0.2, 0.4, 0.6, 0.8]), ("val", [0.1, 0.5, 0.7])):
+        for frame, time in zip(scene.contents[split]["frames"], times, strict=True):
+            frame["time"] = time
+    expected = {}
+    for split, content in scene.contents.items():
+        expected[split] = [found(frame["time"]) for frame in content["frames"]]
+        for frame in content["frames"]:
+            frame |= write(frame.pop("time"))
+        scene.write(split)
+    is_mapped = scene.frame(-1, "test").get("time") != 0.5
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        parts = [scene.read(splits=("train", "val")).splits, scene.read(splits=("test",)).splits]
+    assert all("is mapped to times from 0 to 1" in str(each.message) for each in said)
+    assert bool(said) is is_mapped
+    for split, views in {**parts[0], **parts[1]}.items():
+        assert views.times.tolist() == pytest.approx(expected[split]), split
+
+
+@pytest.mark.parametrize("time", [..., None])
+def test_a_frame_without_a_time_is_left_out(scene, time):
+    scene.frame(1)["time"] = time
+    if time is ...:
+        del scene.frame(1)["time"]
+    scene.write()
+    words = '1 of 5 frames are left out:(.|\n)*frame 1 .*has no "time", but 4 of 5'
+    with pytest.warns(UserWarning, match=words):
+        assert len(scene.read().splits["train"]) == 4
+
+
 def test_video_is_read_when_there_is_one(scene):
     scene.add("video", 3, fixed=True)
     video = scene.read(resolution=6).video
@@ -471,6 +513,18 @@ def test_a_lens_that_folds_inside_its_images(scene):
 # Masks
 
 
+def test_masks_of_a_car_bonnet_are_ignored(scene):
+    mask = np.full((12, 12), 255, np.uint8)
+    mask[9:] = 0
+    Image.fromarray(mask).save(scene.path / "train" / "bonnet.png")
+    for index in range(5):
+        scene.frame(index)["mask_path"] = "train/bonnet.png"
+    scene.write()
+    views = scene.read().splits["train"]
+    assert views.ignored[:, 9:].all()
+    assert not views.ignored[:, :9].any()
+
+
 def test_masks_become_alpha(scene):
     (scene.path / "masks").mkdir()
     mask = np.zeros((12, 12), np.uint8)
@@ -484,10 +538,10 @@ def test_masks_become_alpha(scene):
     for name in ("grey", "rgb", "ones"):
         scene.frame(1)["mask_path"] = f"masks/{name}.png"
         scene.write()
-        views = scene.read().splits["train"]
+        views = scene.read(mask_use="alpha").splits["train"]
         share = (mask if name != "ones" else mask // 255 * 255)[..., None] / 255
         assert np.abs(views.image(1).numpy() - straight * share).max() <= 0.5 + 1e-4, name
-        assert torch.equal(views.image(0), scene.read().splits["train"].image(0))
+        assert torch.equal(views.image(0), scene.read(mask_use="alpha").splits["train"].image(0))
     # A mask is averaged with its image.
     scene.frame(1)["mask_path"] = "masks/grey.png"
     scene.write()
@@ -495,7 +549,7 @@ def test_masks_become_alpha(scene):
     masked[..., 3] = mask
     whole = np.concatenate([masked[..., :3], masked[..., 3:]], axis=2)
     expected = whole.reshape(4, 3, 4, 3, 4).mean(axis=(1, 3))
-    found = scene.read(resolution=4).splits["train"].image(1).numpy()
+    found = scene.read(resolution=4, mask_use="alpha").splits["train"].image(1).numpy()
     assert np.abs(found - expected).max() <= 0.5 + 1e-3
 
 
@@ -518,8 +572,7 @@ REFUSED_FRAMES = [
     ("transform_matrix", np.array(pose(1)).T.tolist(), "last row"),
     ("transform_matrix", SINGULAR.tolist(), "not orthonormal"),
     ("transform_matrix", (np.array(pose(1)) * [-1, 1, 1, 1]).tolist(), "determinant -1"),
-    *(("time", time, r"\[0, 1\]") for time in (-0.1, 1.1, math.nan, math.inf, "soon", None, True)),
-    ("time", ..., "4 of 5 frames"),
+    *(("time", time, "must be a number") for time in (math.nan, math.inf, "soon", [0.5], True)),
     ("mask_path", "../low.png", "mask_path leaves the scene's folder"),
     ("mask_path", 3, "it must be text"),
 ]

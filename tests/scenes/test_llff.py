@@ -49,8 +49,13 @@ def test_cameras_and_images_of_the_width_asked_for(folder, resolution, width):
 
 def test_captures_of_dynamic_scenes_have_the_times_in_their_names(folder):
     assert read(folder, static=False).splits["train"].times[3] == pytest.approx(3 / 9)
+    for number in range(3):  # Nvidia's Dynamic Scenes have a folder for each moment.
+        save(folder / f"mv_images/{number:05d}/cam01.png", picture(number))
+    assert LlffSettings.recognises(folder)
+    assert not MultiCameraSettings.recognises(folder)
     (folder / "motion_masks").mkdir()
-    scene = read(folder)
+    with pytest.warns(UserWarning, match="motion_masks is not read"):
+        scene = read(folder)
     assert scene.splits["train"].times[3] == pytest.approx(3 / 9)
     assert "IMG_9.JPG -> 9" in scene.notes["times"]
     assert read(folder, static=True).splits["train"].times.tolist() != [0.0] * COUNT

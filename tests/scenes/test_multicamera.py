@@ -2,6 +2,7 @@
 
 import json
 import logging
+import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
@@ -359,18 +360,43 @@ def test_cameras_of_different_lengths_and_rates(videos: Path, tmp_path: Path, ca
     assert times["cam01"] == pytest.approx([i / 30 / last for i in range(FRAMES)], abs=0.01)
 
 
-def test_a_frame_that_one_camera_lacks_is_noticed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("apart", [0, 100])
+@pytest.mark.parametrize("gone", [[FRAMES - 1], [2], [0], [1, FRAMES - 1]])
+def test_a_frame_that_one_camera_lacks_is_left_out(tmp_path: Path, apart: int, gone: list) -> None:
     folder = neural_3d_video(tmp_path / "scene", write_images, "")
-    whole = len(read(folder).splits["train"])
-    (folder / "cam02" / f"{5 + FRAMES - 1}.png").unlink()  # The last one: it stopped early.
-    assert len(read(folder).splits["train"]) < whole
-    for camera in range(CAMERAS):  # Another number for the same moment.
+    whole = read(folder).splits["train"]
+    for camera in range(CAMERAS):  # Cameras may have their own numbers for the same moment.
         for path in sorted((folder / f"cam{camera:02d}").iterdir(), key=lambda p: int(p.stem)):
-            path.rename(path.with_name(f"x{int(path.stem) + 100 * camera}.png"))
-    assert len(read(folder).splits["train"]) < whole
-    (folder / "cam02" / "x206.png").unlink()
-    with pytest.raises(SceneError, match=r"cam02: image number 2 is x207\.png, but cam00/x6\.png"):
+            path.rename(path.with_name(f"x{int(path.stem) + apart * camera}.png"))
+    for number in gone:
+        (folder / "cam02" / f"x{5 + number + 2 * apart}.png").unlink()
+    words = f"not all cameras have an image .* {3 * len(gone)} images are left out"
+    with pytest.warns(UserWarning, match=words):
+        views = read(folder).splits["train"]
+    if apart and 0 in gone:
+        return  # Nobody can tell whether the first or the last one is missing.
+    kept = [number for number in range(FRAMES) if number not in gone]
+    times = [(number - kept[0]) / (kept[-1] - kept[0]) for number in kept]
+    assert views.times.tolist() == pytest.approx(times * (CAMERAS - 1))
+    places = [camera * FRAMES + number for camera in range(CAMERAS - 1) for number in kept]
+    assert torch.equal(views.in_memory(), whole.in_memory()[places])
+
+
+def test_images_that_are_missing_beside_videos(tmp_path: Path) -> None:
+    folder = neural_3d_video(tmp_path / "scene", write_images, "")
+    write_video(folder / "cam03.mp4", rgb(3))
+    shutil.rmtree(folder / "cam03")
+    (folder / "cam02" / "7.png").unlink()
+    with pytest.raises(SceneError, match=r"numbers of cam00/7\.png, cam01/7\.png\. Add what is"):
         read(folder)
+
+
+def test_folders_beside_cameras_are_none(tmp_path: Path) -> None:
+    folder = neural_3d_video(tmp_path / "scene", write_images, "")
+    whole = read(folder).splits["train"]
+    for name in ("camera_paths", "mv_images/00000", "mv_images/00001"):
+        write_images(folder / name, rgb(0)[:1])
+    assert torch.equal(read(folder).splits["train"].in_memory(), whole.in_memory())
 
 
 def test_damaged_files_are_named(videos: Path, tmp_path: Path) -> None:

@@ -19,6 +19,13 @@ from xplanes.scenes.name_times import times_in_names
         ("IMG_20260102_115958 IMG_20260102_115959 IMG_20260102_120002", [0, 0.25, 1]),
         ("PXL_20260102_115959500 PXL_20260102_120000000 PXL_20260102_120001500", [0, 0.25, 1]),
         ("2026-01-31.23.59.59 2026-02-01.00.00.00 2026-02-01.00.00.03", [0, 0.25, 1]),
+        (
+            "DJI_20260102115959_0001_V DJI_20260102120000_0002_V DJI_20260102120003_0003_V",
+            [0, 0.25, 1],
+        ),
+        ("vlcsnap-2026-01-02-12h00m01s000 vlcsnap-2026-01-02-12h00m01s400", [0, 1]),
+        ("1700000000_123 1700000000_373 1700000001_123", [0, 0.25, 1]),
+        ("034_device1 036_device2 042_kinect1", [0, 0.25, 1]),
         ("034_cam0 036_cam1 042_cam0", [0, 0.25, 1]),
         ("3_cam0 3_cam1 3_cam2 4_cam0 4_cam1 4_cam2 7_cam1", [0, 0, 0, 0.25, 0.25, 0.25, 1]),
         ("0034_0 0036_1 0042_0", [0, 0.25, 1]),
@@ -44,6 +51,8 @@ def test_names_tell_times(names: str, times: list[float]) -> None:
     [
         (["00_58.png", "00_59.png", "01_00.png", "01_01.png", "01_02.png"], r"01_00\.png -> 0\)"),
         ([f"a_{i // 4}_{'xy'[i % 2]}{'pq'[i % 4 // 2]}.png" for i in range(16)], "only 4, for 16"),
+        ([f"{i:06d}/{j:02d}.png" for i in range(4) for j in range(2)], "taken for cameras"),
+        (["t_-2.png", "t_1.png", "t_2.png"], "-2"),
     ],
 )
 def test_times_that_are_hardly_those_of_the_images_are_shown(names, words) -> None:

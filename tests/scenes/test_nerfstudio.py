@@ -203,10 +203,14 @@ def test_times_from_0_to_1_stay(capture, caplog):
         views = capture.read().splits["train"]
     assert float(views.times.min()) == pytest.approx(0.1)
     assert "mapped" not in caplog.text
-    del capture.frames[4]["time"]
-    capture.refused('frame 4.*has no "time", but 9 of 10')
     capture.frames[4]["time"] = "soon"
-    capture.refused("time is 'soon'; it must be a number in any unit")
+    capture.refused("time is 'soon'; it must be a number")
+    del capture.frames[4]["time"]
+    with pytest.warns(UserWarning, match='out:\n.*frame 4.*has no "time", but 9 of 10'):
+        capture.read()
+    for frame in capture.frames[5:]:
+        frame["time"] = None
+    capture.refused('frame 4.*has no "time", but 4 of 10')
 
 
 def label_masks():
@@ -379,6 +383,27 @@ def test_alpha_beside_images_is_read(capture, name):
     assert not views.image(0)[band() == 0].any()
 
 
+def test_a_missing_mask_is_not_the_image_itself(capture):
+    masked(capture, band())
+    for frame in capture.frames:
+        frame["mask_path"] = f"masks/{Path(frame['file_path']).name}"
+        name = f"masks/{int(frame['file_path'][-9:-4])}.png"
+        (capture.path / name).rename(capture.path / frame["mask_path"])
+    (capture.path / capture.frames[3]["mask_path"]).unlink()
+    with pytest.warns(UserWarning, match="1 of 10 frames are left out:(.|\n)*frame 3.*no mask of"):
+        assert len(capture.read(eval_every=100).splits["train"]) == 9
+
+
+@pytest.mark.parametrize("name", ["mask/{}.png", "images/{}_mask.png", "Masks_2/{}.png"])
+def test_masks_that_nothing_names_are_told_of(capture, name):
+    for frame in capture.frames:
+        path = capture.path / name.format(Path(frame["file_path"]).stem)
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray(band()).save(path)
+    with pytest.warns(UserWarning, match=f"{name.split('{')[0].rstrip('/')}.* is not read"):
+        assert capture.read().splits["train"].ignored is None
+
+
 def test_one_mask_of_all_images_is_no_silhouette(capture):
     """Such as the circle that nerfstudio's own tool draws for fisheye images."""
     masked(capture, disc())
@@ -537,6 +562,8 @@ FLATTER = 2 * math.atan(math.tan(0.5 * ANGLE) / 1.25)
         ({"fl_x": "30.5", "fl_y": "3e1", "w": f"{SIZE}", "h": SIZE}, [30.5, 30], ""),
         ({"intrinsic_matrix": [[31, 0, 12, 0], [0, 29, 12, 0], [0, 0, 1, 0]]}, [31, 29], ""),
         ({"K": [[31, 0, 12], [0, 31, 12], [0, 0, 1]], "fl_x": 30}, [30, 31], ""),
+        ({"K": [31, 0, 12, 0, 29, 12, 0, 0, 1]}, [31, 29], ""),
+        ({"fx": 31, "fy": "29", "cx": 12, "cy": 12, "width": SIZE, "height": SIZE}, [31, 29], ""),
         ({"x_fov": DEGREES, "fl_x": 99, "w": SIZE, "h": SIZE}, [FOCAL, FOCAL], ""),
         ({"x_fov": DEGREES, "y_fov": DEGREES}, [FOCAL, FOCAL], ""),
         ({"fovx": DEGREES, "fovy": DEGREES}, [FOCAL, FOCAL], ""),
@@ -635,7 +662,7 @@ def test_images_elsewhere_or_one_folder_deeper(capture):
     assert found == tuple(f"images/{file}" for file in expected)
 
 
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-32"])
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"])
 def test_a_file_in_another_encoding_is_read(capture, encoding):
     (capture.path / "images").rename(capture.path / "bildér")
     for frame in capture.frames:
@@ -655,6 +682,7 @@ def test_a_file_in_another_encoding_is_read(capture, encoding):
         lambda name: name.replace("images", "Images").upper(),
         lambda name: unicodedata.normalize("NFD", name),
         lambda name: f"/home/somebody/ball/{name}",
+        lambda name: f"../ball/{name}",
     ],
 )
 def test_images_are_found_by_names_that_are_nearly_theirs(capture, change):
@@ -664,6 +692,31 @@ def test_images_are_found_by_names_that_are_nearly_theirs(capture, change):
         path.rename(named)
         frame["file_path"] = change(f"images/{named.name}")
     assert len(capture.read(eval_every=100).splits["train"]) == 10
+
+
+def test_a_link_to_nothing_is_a_missing_image(capture):
+    path = capture.path / capture.frames[3]["file_path"]
+    path.unlink()
+    path.symlink_to(capture.path.parent / "gone.png")
+    with pytest.warns(UserWarning, match=r"1 of 10 frames are left out:(.|\n)*frame 3.*no image"):
+        assert len(capture.read(eval_every=100).splits["train"]) == 9
+
+
+@pytest.mark.parametrize("name", ["spherical", "PANORAMA", "cylindrical"])
+def test_lenses_that_are_no_perspective_are_refused_wherever_they_stand(capture, name):
+    capture.frames[3]["camera_model"] = name
+    capture.refused(f"frame 3.*camera_model={name.upper()} is not a lens")
+    del capture.frames[3]["camera_model"]
+    capture.content["camera_model"] = name
+    capture.refused(f"json: camera_model={name.upper()} is not a lens")
+
+
+@pytest.mark.parametrize("name", ["pinhole_6", 2])
+def test_lenses_of_unknown_names_are_told_of(capture, name):
+    capture.content |= {"camera_model": name, "k1": 0.01}
+    with pytest.warns(UserWarning, match=f"camera_model='{str(name).upper()}' is not known"):
+        lens = capture.read().splits["train"].intrinsics.lens(0)
+    assert float(lens.coefficients[0, 0]) == 0.01
 
 
 def test_a_name_that_several_images_have_is_none_of_them(capture):

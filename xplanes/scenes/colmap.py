@@ -1,7 +1,6 @@
 """Captures registered with COLMAP: a sparse model and its images."""
 
 import csv
-import io
 import logging
 import math
 import os
@@ -160,8 +159,9 @@ class ColmapSettings(CaptureSettings):
 
     def _masks(self, names: Sequence[str], masks: str) -> tuple[Path | None, ...]:
         kinds = [
-            (f"{name}.png", name, PurePosixPath(name).with_suffix(".png").as_posix())
+            (name, stem, f"{stem}_mask", f"{stem}.mask")
             for name in names
+            if (stem := PurePosixPath(name).with_suffix("").as_posix())
         ]
         return mask_files(self.folder / masks, kinds)
 
@@ -325,8 +325,11 @@ def _ranks(names: Sequence[str], present: set[str]) -> list[float]:
 def _listed_times(path: Path, names: Sequence[str]) -> list[float]:
     """The time of each image from a CSV file."""
     try:
-        rows = list(csv.DictReader(io.StringIO(decoded(path.read_bytes()), newline="")))
-    except (OSError, UnicodeDecodeError, csv.Error) as problem:
+        header, *lines = decoded(path.read_bytes()).splitlines(keepends=True) or [""]
+        mark = max(",;\t", key=header.count)  # Spreadsheets may write semicolons.
+        keys = [key.strip(' "\r\n').lower() for key in header.split(mark)]
+        rows = list(csv.DictReader(lines, keys, delimiter=mark, skipinitialspace=True))
+    except (OSError, ValueError, csv.Error) as problem:
         raise SceneError(
             f"data.times={path} cannot be read as CSV ({problem}). Write one line for each image, "
             "with the columns file and time, or set data.times=null."

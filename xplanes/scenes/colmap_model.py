@@ -17,8 +17,8 @@ from typing import BinaryIO, TypeVar
 
 import numpy as np
 
-from xplanes.errors import SceneError
-from xplanes.scenes.entries import decoded, number_in, require_fetched, short
+from xplanes.errors import BrokenFrameError, SceneError
+from xplanes.scenes.entries import decoded, number_in, require_fetched, short, usable
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
 from xplanes.scenes.listing import Calibration
 
@@ -131,16 +131,18 @@ def read_model(folder: Path) -> SparseModel:
             f"{images_path} lists no images: COLMAP has registered none. Run its mapper again, or "
             "choose another model."
         )
+    posed = usable("images", lambda image: _pose(image[2], image[3]), images)
+    images = [(*images[place][:2], pose) for place, pose in posed]
     for (name, *_), (after, *_) in pairwise(images):
         if name == after:
             raise SceneError(f"{images_path} lists {name} twice. Remove one of the two.")
-    for name, _, camera in images:
+    for name, camera, _ in images:
         if camera not in cameras:
             raise SceneError(
                 f"{images_path}: {name} was taken by camera {camera}, which {cameras_path.name} "
                 f"does not list. Both files must be of one model: copy or export them again."
             )
-    names, poses, numbers = zip(*images, strict=True)
+    names, numbers, poses = zip(*images, strict=True)
     points_path = _found(folder, "points3D")
     points, error = (None, math.nan) if points_path is None else _points(points_path)
     calibrations = tuple(cameras[camera] for camera in numbers)
@@ -273,8 +275,8 @@ def _cameras(path: Path) -> Iterator[tuple[str, int, Lens]]:
             yield f"{label} (camera {camera})", camera, lens
 
 
-def _images(path: Path) -> Iterator[tuple[str, np.ndarray, int]]:
-    """Name, pose and camera of each image of a file."""
+def _images(path: Path) -> Iterator[tuple[str, int, str, Sequence[float]]]:
+    """Name, camera, label and world-to-camera motion of each image of a file."""
     if path.suffix == ".bin":
         with _binary(path) as file:
             for what in file.entries("image"):
@@ -282,7 +284,7 @@ def _images(path: Path) -> Iterator[tuple[str, np.ndarray, int]]:
                 name = file.text(what)
                 (count,) = file.take(COUNT, what)
                 file.skip(POINT_IN_IMAGE * count, f"{what} ({name})")
-                yield name, _pose(f"{path}: {name}", motion), camera
+                yield name, camera, f"{path}: {name}", motion
         return
 
     def parse(words: list[str]) -> tuple[list[float], int, str]:
@@ -300,7 +302,7 @@ def _images(path: Path) -> Iterator[tuple[str, np.ndarray, int]]:
             label, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", parse, most=9
         )
         count += 1
-        yield name, _pose(f"{label} ({name})", motion), camera
+        yield name, camera, f"{label} ({name})", motion
     with path.open("rb") as file:
         stated = re.search(rb"# Number of images: (\d+)", file.read(HEADER))
     if stated and count < int(stated[1]):
@@ -392,8 +394,10 @@ def _calibration(
 def _pose(label: str, motion: Sequence[float]) -> np.ndarray:
     """Camera-to-world matrix from a world-to-camera quaternion, real part first, and shift."""
     values = np.array(motion, dtype=np.float64)
+    if not np.isfinite(values).all():
+        raise BrokenFrameError(f"{label}: the pose is {values.tolist()}. Export the model again.")
     length = math.hypot(*values[:4])
-    if not np.isfinite(values).all() or abs(length - 1) > UNIT_TOLERANCE:
+    if abs(length - 1) > UNIT_TOLERANCE:
         raise SceneError(
             f"{label}: the pose is {values.tolist()}; it must be a unit quaternion QW QX QY QZ and "
             "a finite translation TX TY TZ. The file is damaged: export the model again."

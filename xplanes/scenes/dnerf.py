@@ -7,9 +7,13 @@ from typing import ClassVar
 
 from xplanes.errors import MissingSplitError, SceneError, warn
 from xplanes.scenes.listing import Listing, read_views
-from xplanes.scenes.source import SceneSettings
-from xplanes.scenes.transforms import read_transforms
+from xplanes.scenes.masks import MaskUse
+from xplanes.scenes.source import SceneSettings, warn_of_masks
+from xplanes.scenes.transforms import listing_of, read_frames, time_span
 from xplanes.scenes.views import Scene
+
+PARTS = ("train", "val", "test", "video")
+"""Splits, and the video of a fixed camera, whose times have one unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,20 +26,29 @@ class BlenderSettings(SceneSettings):
         "data=demo"
     )
 
+    # Use of masked-out pixels. alpha: empty space; ignore: neither trained on nor scored; auto:
+    # alpha if masks look like silhouettes, else ignore; lrm: only the LRM's input is masked.
+    mask_use: MaskUse = "auto"
+
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         return (folder / "transforms_train.json").is_file()
 
     def load(self, splits: Sequence[str]) -> Scene:
-        return read_scene(self, splits)
+        scene = read_scene(self, splits, self.mask_use)
+        if "masks" not in scene.notes:
+            files = [file for views in scene.splits.values() for file in views.files]
+            warn_of_masks(self.folder, [self.folder / file for file in files])
+        return scene
 
 
-def read_scene(settings: SceneSettings, splits: Sequence[str]) -> Scene:
+def read_scene(settings: SceneSettings, splits: Sequence[str], mask_use: MaskUse = "auto") -> Scene:
     """Read and check a whole scene, so that nothing fails after training has begun.
 
     Args:
         settings: Settings with its folder, which contains transforms_train.json and the images.
         splits: Names of the splits to read, such as train, val, test.
+        mask_use: Meaning of the black parts of masks.
 
     Returns:
         The scene, with ``video`` if transforms_video.json exists.
@@ -47,20 +60,21 @@ def read_scene(settings: SceneSettings, splits: Sequence[str]) -> Scene:
     if not any(folder.glob("transforms_*.json")):
         raise settings.no_scene()
     paths = {split: _transforms_path(folder, split) for split in dict.fromkeys(splits)}
-    listed = settings.thinned({split: _listed(split, path) for split, path in paths.items()})
-    video = _list_video(folder)
+    span = time_span([folder / f"transforms_{part}.json" for part in PARTS])
+    listed = {split: _listed(split, path, span) for split, path in paths.items()}
+    listed = settings.thinned(listed)
+    video = _list_video(folder, span)
     _require_times(folder, listed, video)
-    told = any(part.mask_meaning for part in listed.values())
     frames = None
     if video is not None:
         frames = read_views(video, settings.resolution, settings.image_cache)
-    return settings.scene_of(listed, "auto" if told else "alpha", video=frames)
+    return settings.scene_of(listed, mask_use, video=frames)
 
 
-def _listed(split: str, path: Path) -> Listing:
+def _listed(split: str, path: Path, span: tuple[float, float] | None) -> Listing:
     """The frames of a split; if one that is only scored has none, warns and leaves it out."""
     try:
-        return read_transforms(path)
+        return listing_of(path, read_frames(path), span)
     except MissingSplitError as problem:
         if split != "train":
             warn(f"The {split} split is left out. {problem}")
@@ -99,11 +113,11 @@ def _transforms_path(folder: Path, split: str) -> Path:
     raise MissingSplitError(f"{path} does not exist. Splits of this scene: {names}. {way_out}")
 
 
-def _list_video(folder: Path) -> Listing | None:
+def _list_video(folder: Path, span: tuple[float, float] | None) -> Listing | None:
     path = folder / "transforms_video.json"
     if not path.is_file():
         return None
-    listing = read_transforms(path)
+    listing = listing_of(path, read_frames(path), span)
     poses = listing.camera_to_world
     if not poses.allclose(poses[:1].expand_as(poses), atol=1e-4):
         raise SceneError(

@@ -1,6 +1,5 @@
 """Reading and checking of names, poses, numbers and times in camera files."""
 
-import codecs
 import json
 import logging
 import math
@@ -139,7 +138,7 @@ def _stems_at(folder: Path, changed: int) -> dict[str, list[Path]]:
     inside = sorted(folder.iterdir())
     if len(inside) == 1 and inside[0].is_dir():  # The archive was unpacked one level too deep.
         inside = sorted(inside[0].iterdir())
-    for path in filter(is_image, inside):
+    for path in filter(Path.is_file, filter(is_image, inside)):
         found.setdefault(_plain(path.stem), []).append(path)
     return found
 
@@ -177,13 +176,11 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
     if not isinstance(name, str) or not name or "\0" in name:
         raise SceneError(f"{label}: {key} is {short(name)}; it must be text such as {example}.")
     # Blender on Windows writes backslashes.
-    parts = PurePosixPath(os.path.normpath(name.replace("\\", "/"))).parts
-    absolute = bool(PureWindowsPath(name).anchor)
-    if absolute:
-        whole = Path(*parts)
-        if whole.is_relative_to(folder):
-            parts = whole.relative_to(folder).parts
-    elif ".." in parts:
+    whole = Path(os.path.normpath(folder / name.replace("\\", "/")))
+    parts = whole.parts
+    if whole.is_relative_to(folder):
+        parts = whole.relative_to(folder).parts
+    elif not PureWindowsPath(name).anchor:
         raise SceneError(
             f"{label}: {key} leaves the scene's folder {folder} (it is {name}). Put its files "
             f"inside the folder and correct {key}."
@@ -204,20 +201,19 @@ def mask_files(
 
     Args:
         folder: Folder of masks.
-        names: Possible names of each image's mask, in order of preference. [V]
+        names: Possible names of each image's mask without the ending, in order of preference. [V]
         key: The setting that names the folder.
 
     Raises:
         SceneError: If no image has a mask.
     """
-    masks = tuple(
-        next((path for name in each if (path := folder / name).is_file()), None) for each in names
-    )
-    bare = [each[0] for each, mask in zip(names, masks, strict=True) if mask is None]
+    root = _like(folder)
+    masks = tuple(None if root is None else _mask(root, each) for each in names)
+    bare = [f"{each[0]}.png" for each, mask in zip(names, masks, strict=True) if mask is None]
     if len(bare) == len(masks):
         raise SceneError(
-            f"{key}: {folder} {'holds' if folder.is_dir() else 'does not exist, so there is'} no "
-            f"mask of any image, such as {bare[0]}. Put the masks there, or set {key}=null."
+            f"{key}: {folder} {'holds' if root else 'does not exist, so there is'} no mask of any "
+            f"image, such as {bare[0]}. Put the masks there, or set {key}=null."
         )
     if bare:
         warn(
@@ -227,10 +223,25 @@ def mask_files(
     return masks
 
 
-def unit_times(times: Sequence[float]) -> list[float]:
-    """Times in any unit, mapped to [0, 1]; all 0 if they are equal."""
+def _mask(root: Path, names: Sequence[str]) -> Path | None:
+    """The mask that has one of the names; PNG takes precedence over other endings."""
+    for name in names:
+        if (parent := _like((root / name).parent)) is not None:
+            found = _stems(parent).get(_plain(PurePosixPath(name).name), [])
+            if len(chosen := [path for path in found if path.suffix == ".png"] or found) == 1:
+                return chosen[0]
+    return None
+
+
+def unit_times(times: Sequence[float], span: tuple[float, float] | None = None) -> list[float]:
+    """Times in any unit, mapped to [0, 1]; all 0 if they are equal.
+
+    Args:
+        times: The times. [V]
+        span: First and last time of the capture; those of ``times`` when None.
+    """
     # Subtracted before conversion to float, which cannot represent clocks in nanoseconds exactly.
-    first, last = min(times), max(times)
+    first, last = span or (min(times), max(times))
     return [(time - first) / (last - first) if last > first else 0.0 for time in times]
 
 
@@ -269,19 +280,8 @@ def _parsed(text: str) -> Any:
 
 
 def decoded(content: bytes) -> str:
-    """Text in UTF-8, or in UTF-16 or UTF-32 if a byte order mark indicates it.
-
-    Some editors write a byte order mark; PowerShell writes UTF-16.
-    """
-    for mark, encoding in (
-        (codecs.BOM_UTF32_LE, "utf-32"),
-        (codecs.BOM_UTF32_BE, "utf-32"),
-        (codecs.BOM_UTF16_LE, "utf-16"),
-        (codecs.BOM_UTF16_BE, "utf-16"),
-    ):
-        if content.startswith(mark):
-            return content.decode(encoding)
-    return content.decode("utf-8-sig")
+    """Text in UTF-8, UTF-16 or UTF-32, with or without a byte order mark."""
+    return content.decode(json.detect_encoding(content))
 
 
 def require_fetched(path: Path) -> None:

@@ -9,7 +9,7 @@ import logging
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar
 
@@ -58,6 +58,9 @@ TRANSFORMS = "transforms.json"
 
 NUMBERED = re.compile(r"(?i)((view|camera|c|v)[_-]?\d+|\d\d+)")
 """Pattern of camera names other than cam*."""
+
+MOMENTS = "mv_images"
+"""Folder with a subfolder for each moment, as in Nvidia's Dynamic Scenes."""
 
 IMAGES = ("images", "image", "rgb", "frames")
 """Names of the subfolder with a camera's images, if the camera has several subfolders."""
@@ -129,7 +132,7 @@ class MultiCameraSettings(SceneSettings):
                     "cameras to score with data.test_cameras=[NAME], or leave data.eval_split out."
                 )
         watched = _video_camera(cameras, parts, self.video_camera)
-        recordings = [_recording(camera) for camera in cameras]
+        recordings = _simultaneous([_recording(camera) for camera in cameras])
         poses = torch.from_numpy(np.stack([camera.pose for camera in cameras]))
         images = [image for recording in recordings for image in recording.images[:1]]
         turn, up = world_turn(poses, images if len(images) == len(poses) else (), self.orient)
@@ -145,7 +148,9 @@ class MultiCameraSettings(SceneSettings):
             return whole.subset(torch.cat([(owner == camera).nonzero()[:, 0] for camera in chosen]))
 
         chosen = self.thinned({split: views_of(parts[split]) for split in dict.fromkeys(splits)})
-        origin = "when the videos show their frames" if stamped else "the numbers of the frames"
+        origin = "the numbers of the frames"
+        if stamped and not images:
+            origin = "when the videos show their frames"
         last = max(each[-1] for each in numbers)
         notes = {"times": f"{origin}, from {numbers[0][0]} to {last}", "up": up}
         return Scene(folder.resolve().name, chosen, video=views_of([watched]), notes=notes)
@@ -180,7 +185,8 @@ class Recording:
         count: Number of frames.
         rate: Frames per second; None for images and if the video has none.
         images: The image files in the order of time; empty for a video. [count]
-        times: Presentation times of a video's frames in seconds; empty if unknown. [count]
+        times: Presentation times of a video's frames in seconds, or numbers of images if some are
+            left out; empty if unknown. [count]
     """
 
     camera: Camera
@@ -228,15 +234,17 @@ def recordings_of_cameras(folder: Path) -> list[Path]:
     inside = sorted(filter(_is_recording, folder.iterdir()))
     numbered = [path for path in inside if NUMBERED.fullmatch(path.stem)]
     numbered.sort(key=lambda path: natural(path.name))
-    return [path for path in inside if path.name.lower().startswith("cam")] or numbered
+    named = [path for path in inside if path.name.lower().startswith("cam")]
+    # Without others, such as camera_paths.
+    return [path for path in named if re.search(r"\d", path.name)] or named or numbered
 
 
 def _recordings(folder: Path) -> list[Path]:
     """Recordings in a folder, or in its only subfolder that has some, such as videos."""
     if found := recordings_of_cameras(folder):
         return found
-    deeper = [recordings_of_cameras(path) for path in folder.iterdir() if path.is_dir()]
-    deeper = [paths for paths in deeper if paths]
+    inside = [path for path in folder.iterdir() if path.is_dir() and path.name != MOMENTS]
+    deeper = [paths for path in inside if (paths := recordings_of_cameras(path))]
     return deeper[0] if len(deeper) == 1 else []
 
 
@@ -519,35 +527,54 @@ def _are_stamped(recordings: Sequence[Recording]) -> bool:
     return False
 
 
-def _require_same_frames(recordings: Sequence[Recording]) -> None:
-    """Refuse folders of numbered images if a camera lacks some in the middle.
+def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
+    """The recordings without images of moments that some camera lacks; warns about these.
 
-    Its later frames would be paired with earlier ones of other cameras. Numbering may start at any
-    number, and some cameras may have stopped early.
+    Images of equal numbers are simultaneous. If the cameras' numbers do not overlap, they are
+    counted from the first of each camera.
+
+    Raises:
+        SceneError: If images are missing, and other cameras have videos.
     """
-    first: tuple[Recording, list[int]] | None = None
-    for recording in recordings:
-        found = [re.findall(r"\d+", path.stem) for path in recording.images or ()]
-        if not found or not all(found):
-            continue
-        numbers = [int(digits[-1]) - int(found[0][-1]) for digits in found]
-        first = first or (recording, numbers)
-        for place, (number, other) in enumerate(zip(numbers, first[1], strict=False)):
-            if number != other:
-                paths = [r.images[place] for r in (recording, first[0]) if r.images]
-                raise SceneError(
-                    f"{recording.camera.source}: image number {place + 1} is {paths[0].name}, but "
-                    f"{paths[1].parent.name}/{paths[1].name} in {first[0].camera.name}. One of the "
-                    "cameras lacks a frame before it, and frames must be simultaneous: add it, or "
-                    "remove the frame from all cameras."
-                )
+    numbers: dict[int, list[int]] = {}
+    for camera, recording in enumerate(recordings):
+        found = [re.findall(r"\d+", path.stem) for path in recording.images]
+        if found and all(found):
+            numbers[camera] = [int(digits[-1]) for digits in found]
+    each = list(numbers.values())
+    if not each or any(len({*own}) < len(own) for own in each):
+        return list(recordings)
+    if max(own[0] for own in each) > min(own[-1] for own in each):
+        numbers = {camera: [n - own[0] for n in own] for camera, own in numbers.items()}
+    common = set.intersection(*map(set, numbers.values()))
+    lost = {
+        f"{recordings[camera].camera.name}/{path.name}"
+        for camera, own in numbers.items()
+        for number, path in zip(own, recordings[camera].images, strict=True)
+        if number not in common
+    }
+    if not lost:
+        return list(recordings)
+    text = (
+        f"{recordings[0].camera.source.parent}: frames must be simultaneous, but not all cameras "
+        f"have an image of the numbers of {some(sorted(lost, key=natural))}"
+    )
+    if len(numbers) < len(recordings):
+        raise SceneError(f"{text}. Add what is missing, or extract the images of all videos.")
+    warn(f"{text}. {len(lost)} images are left out.")
+    chosen = []
+    for camera, own in numbers.items():
+        kept = [place for place, number in enumerate(own) if number in common]
+        images = tuple(recordings[camera].images[place] for place in kept)
+        times = tuple(float(own[place]) for place in kept)
+        chosen.append(replace(recordings[camera], count=len(kept), images=images, times=times))
+    return chosen
 
 
 def _frame_numbers(
     folder: Path, recordings: Sequence[Recording], frames: Sequence[int] | None, stamped: bool
 ) -> list[range]:
     """Frames to read of each camera: the same numbers, unless they have their own times."""
-    _require_same_frames(recordings)
     shortest = min(recordings, key=lambda recording: recording.count)
     longest = max(recordings, key=lambda recording: recording.count)
     if frames is not None:

@@ -20,19 +20,22 @@ FEW = 0.5
 """Ratio of distinct times to images in a folder below which times are suspicious."""
 
 CAMERA = re.compile(
-    r"(?i)(?<![a-z])(cam|camera|view|lens|sensor|rig)s?[_\- ]*\d+(?![a-z\d])"
+    r"(?i)(?<![a-z])(cam|camera|view|lens|sensor|rig|device|kinect)s?[_\- ]*\d+(?![a-z\d])"
     r"|(?<![^_\-. ])[cv]\d+(?=$|[_\-. ])"
 )
 """The number of a camera, as in 034_cam1."""
 
-CLOCK = re.compile(r"(?<![A-Za-z\d])\d+\.\d+(?=s?$)|(?<!\d)(\d{10})[_-](\d{9}|\d{6})$")
+CLOCK = re.compile(r"(?<![A-Za-z\d])\d+\.\d+(?=s?$)|(?<!\d)(\d{10})[_-](\d{9}|\d{6}|\d{3})$")
 """Seconds and their fraction at the end of a name, as in 1305031102.175304."""
 
 DATE = re.compile(
-    r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_.T ]+(?:at )?"
-    r"(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)(\d*)"
+    r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_.T ]*(?:at )?"
+    r"(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)[s.]?(\d*)"
 )
 """Date and time of day, with parts of a second, as in PXL_20260102_115959250."""
+
+NUMBER = r"(?:(?:(?<=[_ ])|^)-)?\d+"
+"""A whole number; a sign belongs to it at the beginning, or after a separator."""
 
 Number = int | float
 
@@ -90,7 +93,7 @@ def _most_different(texts: Sequence[str]) -> list[Number]:
 
     None for a name without a number.
     """
-    rows = [re.findall(r"\d+", text) for text in texts]
+    rows = [re.findall(NUMBER, text) for text in texts]
     if not all(rows):
         return []
     least = min(map(len, rows))
@@ -139,6 +142,9 @@ def _checked(names: Sequence[str], times: list[Number]) -> list[Number]:
             break
     if not why and _few(names, times):
         why = f"are only {len(set(times))}, for {len(names)} images"
+    folders = sorted({PurePosixPath(name).parent.name for name in names})
+    if not why and len(folders) > 1 and all(re.fullmatch(r"\d{4,}", name) for name in folders):
+        why = f"are those of the files, and the folders {some(folders)} are taken for cameras"
     if why:
         pairs = ", ".join(f"{names[place]} -> {times[place]}" for place in shown)
         warn(f"The times from the numbers in the names {why} ({pairs}). {OTHER_TIMES}")

@@ -108,7 +108,7 @@ class NerfiesSettings(CaptureSettings):
         times, source = self._times(names, metadata)
         masks = ()
         if self.masks is not None:
-            kinds = [(f"{pictures}/{name}.png", f"{name}.png") for name in names]
+            kinds = [(f"{pictures}/{name}", name) for name in names]
             masks = mask_files(folder / self.masks, kinds)
         listing = Listing.checked(
             folder,

@@ -39,7 +39,7 @@ class NerfstudioSettings(CaptureSettings):
         if not path.is_file():
             raise self.no_scene()
         content = read_frames(path)
-        listing = listing_of(path, content, any_unit=True)
+        listing = listing_of(path, content)
         places = _listed_splits(path, content, listing) or held_out(listing, self.eval_every)
         if "train" in splits and not places.get("train"):
             raise SceneError(f'{path} has no frames to train on: fill "train_filenames".')

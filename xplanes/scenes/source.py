@@ -12,6 +12,7 @@ import torch
 
 from xplanes.errors import ConfigError, MissingSplitError, SceneError, warn
 from xplanes.scenes.entries import some, world_turn
+from xplanes.scenes.formats import is_image
 from xplanes.scenes.frame import CubeHints
 from xplanes.scenes.listing import Listing, Part, read_splits, thinned
 from xplanes.scenes.masks import MaskUse
@@ -60,6 +61,31 @@ def as_static(scene: Scene, reason: str) -> Scene:
     if cut is not None:
         cut = replace(cut, times=torch.zeros_like(cut.times))
     return replace(scene, splits=splits, video=video, cut=cut, static_reason=reason)
+
+
+def warn_of_masks(folder: Path, images: Sequence[Path]) -> None:
+    """Warn about files and folders that seem to be masks, but are not read.
+
+    Args:
+        folder: The scene's folder.
+        images: Its images, without masks.
+    """
+    folder, images = folder.resolve(), [path.resolve() for path in images]
+    places, used = {path.parent for path in images}, {*images}
+    found = sorted(
+        path
+        for place in {folder, *places}
+        for path in place.iterdir()
+        if "mask" in path.name.lower() and path not in {*used, *places}
+        if path.is_dir() or is_image(path)
+    )
+    if found:
+        names = some([path.relative_to(folder).as_posix() for path in found])
+        warn(
+            f"{folder}: {names} is not read. If these are masks of the images, name their folder "
+            f"(data.masks={found[0].name}, of colmap and nerfies), or their files (mask_path of "
+            "the frames in transforms files)."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -292,11 +318,8 @@ class CaptureSettings(SceneSettings, ABC):
                     f"Choose another data.eval_split, lower data.eval_every={self.eval_every} (the "
                     f"first and the last image are never held out){self.more_splits}."
                 )
-        if not any(listing.masks) and (folder := self.folder / "masks").is_dir():
-            warn(
-                f"{folder} is not read. If it holds masks of the images, name it with "
-                "data.masks=masks, or its files as mask_path of the frames."
-            )
+        if not any(listing.masks):
+            warn_of_masks(self.folder, listing.paths)
         turn, up = world_turn(listing.camera_to_world, listing.paths, self.orient)
         found = None if points is None else torch.from_numpy(points)
         if turn is not None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from xplanes.errors import MissingSplitError, SceneError, warn
+from xplanes.errors import BrokenFrameError, MissingSplitError, SceneError, warn
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.entries import (
     checked_pose,
@@ -34,8 +34,17 @@ FISHEYES = (
     *("FISHEYE", "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
     "THIN_PRISM_FISHEYE",
 )
-OTHER_MODELS = ("FISHEYE", "EQUIRECTANGULAR", "ORTHO", "OMNI", "VR180", "DIVISION", "EUCM")
+OTHER_MODELS = (
+    *("FISHEYE", "EQUIRECTANGULAR", "ORTHO", "OMNI", "VR180", "DIVISION", "EUCM"),
+    *("SPHERICAL", "CYLINDRICAL", "PANORAM", "360"),
+)
 """Parts of names of unsupported lens models; those above take precedence."""
+
+PERSPECTIVES = (
+    *("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"),
+    *("FULL_OPENCV", "FRAME", "BROWN"),
+)
+"""Names of perspective lens models."""
 
 OTHER_AXES = ("from_mitsuba", "normal_mts_args", "from_na")
 """Keys of instant-ngp and NeuS2 for poses with axes other than OpenGL's."""
@@ -51,6 +60,12 @@ NUMBERS = (
 )
 """Keys with numbers, which some programs write as strings."""
 
+ALIASES = {"fx": "fl_x", "fy": "fl_y", "width": "w", "height": "h"}
+"""Other names of keys in pixels."""
+
+TIMES = ("time", "timestamp")
+"""Keys of times; the first one that a frame has is used."""
+
 DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Order of nerfstudio's list of distortion coefficients."""
 
@@ -62,7 +77,7 @@ MATRICES = ("intrinsic_matrix", "intrinsics", "K")
 
 KNOWN = (
     *("frames", "file_path", "transform_matrix", "transform_matrix_start", "mask_path"),
-    *("time", "timestamp"),
+    *TIMES,
     *("camera_angle_x", "camera_angle_y", "camera_model", "is_fisheye", "distortion_params"),
     *("omega", "train_filenames", "val_filenames", "test_filenames", *PIXELS, *COEFFICIENTS),
     *("sx1", "sy1", "x_fov", "y_fov", "fovx", "fovy", *OTHER_LENSES, *OTHER_AXES),
@@ -94,23 +109,28 @@ SYNONYMS = {"sx1": "s1", "sy1": "s3"}
 """COLMAP's names of a fisheye lens's prism coefficients."""
 
 
-def read_transforms(path: Path) -> Listing:
-    """Read and check a transforms file of the D-NeRF or Blender format.
+def time_span(paths: Sequence[Path]) -> tuple[float, float] | None:
+    """First and last time in several transforms files; None if no frame has a time."""
+    times = []
+    for path in paths:
+        with suppress(SceneError):
+            entries = read_frames(path)["frames"]
+            times += [entry[key] for entry in entries if is_number(entry.get(key := _key([entry])))]
+    return (min(times), max(times)) if times else None
 
-    Raises:
-        SceneError: If anything is missing, out of range, repeated, or outside the scene's folder.
-    """
-    return listing_of(path, read_frames(path))
 
-
-def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False) -> Listing:
+def listing_of(
+    path: Path, content: Mapping[str, Any], span: tuple[float, float] | None = None
+) -> Listing:
     """The frames of a transforms file, checked.
+
+    Times in any unit are mapped to [0, 1], unless their key is "time" and they are in that range.
 
     Args:
         path: The file.
         content: Result of `read_frames`.
-        any_unit: Whether times may be in any unit and have the key "timestamp"; they are then
-            mapped to [0, 1], unless the key is "time" and they are in that range.
+        span: First and last time of the scene, if it has several files; those of this one when
+            None.
 
     Raises:
         SceneError: If anything is missing, out of range, repeated, or outside the scene's folder.
@@ -121,7 +141,7 @@ def listing_of(path: Path, content: Mapping[str, Any], *, any_unit: bool = False
     masks, meaning = [frame.mask for frame in frames], ""
     if not any(masks):
         masks, meaning = _masks_beside(paths)
-    times, source = _times(path, frames, any_unit)
+    times, source = _times(path, frames, span)
     listing = Listing.checked(
         path,
         [frame.label for frame in frames],
@@ -150,7 +170,10 @@ class _Frame(NamedTuple):
 
 
 def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame]:
-    """Usable frames; warns about those without an image or with an infinite pose."""
+    """Usable frames; warns about those without an image, a finite pose, or a time if most have."""
+    entries = content["frames"]
+    key = _key(entries)
+    timed = sum(entry.get(key) is not None for entry in entries)
 
     def read(item: tuple[int, dict[str, Any]]) -> _Frame:
         index, entry = item
@@ -159,9 +182,17 @@ def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame
         pose = checked_pose(label, entry["transform_matrix"])
         mask = entry.get("mask_path") or content.get("mask_path") or None
         mask = None if mask is None else image_path(label, folder, mask, "mask_path")
+        if mask == image:
+            raise BrokenFrameError(f"{label}: there is no mask of the name that mask_path gives.")
+        if timed and entry.get(key) is None:
+            problem = SceneError if 2 * timed <= len(entries) else BrokenFrameError
+            raise problem(
+                f'{label} has no "{key}", but {timed} of {len(entries)} frames of {path.name} do. '
+                "Give every frame a time, or none for a static scene."
+            )
         return _Frame(label, entry, image, mask, pose)
 
-    return [frame for _, frame in usable("frames", read, [*enumerate(content["frames"])])]
+    return [frame for _, frame in usable("frames", read, [*enumerate(entries)])]
 
 
 def _masks_beside(paths: Sequence[Path]) -> tuple[list[Path | None], str]:
@@ -267,12 +298,17 @@ def _plain(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
     lengths, and its converter's fovx are in degrees.
     """
     found = dict(keys)
-    for key in {*NUMBERS} & {*keys}:
-        if isinstance(keys[key], str) and (number := number_in(keys[key])) is not None:
+    for key in {*ALIASES} & {*keys}:
+        if is_positive(number_in(str(keys[key]))):
+            found.setdefault(ALIASES[key], found.pop(key))
+    for key in {*NUMBERS} & {*found}:
+        if isinstance(found[key], str) and (number := number_in(found[key])) is not None:
             found[key] = number
     for key in {*MATRICES} & {*keys}:
         with suppress(TypeError, ValueError, LookupError):
-            (fl_x, _, cx), (_, fl_y, cy) = keys[key][0][:3], keys[key][1][:3]
+            matrix = np.array(keys[key], dtype=np.float64)
+            matrix = matrix.reshape(3, 3) if matrix.size == 9 else matrix.reshape(-1, 4)
+            (fl_x, _, cx), (_, fl_y, cy) = matrix[:2, :3].tolist()
             found = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy} | found
             del found[key]  # Other values get the warning about unknown keys.
     for axis in "xy":
@@ -322,34 +358,34 @@ def read_frames(path: Path) -> dict[str, Any]:
     return _plain(path, content) | {"frames": [_plain(path, each) for each in frames]}
 
 
-def _times(path: Path, frames: Sequence[_Frame], any_unit: bool) -> tuple[list[float], str]:
+def _key(entries: Sequence[Mapping[str, Any]]) -> str:
+    """The key of the frames' times."""
+    given = (key for key in TIMES if any(entry.get(key) is not None for entry in entries))
+    return next(given, TIMES[0])
+
+
+def _times(
+    path: Path, frames: Sequence[_Frame], span: tuple[float, float] | None
+) -> tuple[list[float], str]:
     """Times of all frames, and their source; empty if no frame has a time."""
-    stamped = any_unit and not any("time" in frame.entry for frame in frames)
-    key = "timestamp" if stamped else "time"
-    bare = [frame.label for frame in frames if key not in frame.entry]
-    if len(bare) == len(frames):
+    key = _key([frame.entry for frame in frames])
+    if frames[0].entry.get(key) is None:
         return [], ""
-    kind = "in any unit" if any_unit else "in [0, 1]"
-    if bare:
-        raise SceneError(
-            f'{bare[0]} has no "{key}", but {len(frames) - len(bare)} of {len(frames)} frames of '
-            f"{path.name} do. Give every frame a time {kind}, or none for a static scene."
-        )
-    for frame in frames:
-        time = frame.entry[key]
-        if not is_number(time) or not (any_unit or 0 <= time <= 1):
-            raise SceneError(
-                f"{frame.label}: {key} is {short(time)}; it must be a number {kind}"
-                f"{'' if any_unit else '. Divide frame numbers by the last one'}."
-            )
     times = [frame.entry[key] for frame in frames]
+    for frame, time in zip(frames, times, strict=True):
+        if not is_number(time):
+            raise SceneError(f"{frame.label}: {key} is {short(time)}; it must be a number.")
     names = [frame.entry["file_path"] for frame in frames]
     source = time_source(f'"{key}" of {path.name}', names, times)
-    first, last = min(times), max(times)
-    if not any_unit or (not stamped and first >= 0 and last <= 1):
+    first, last = span or (min(times), max(times))
+    if key == "time" and first >= 0 and last <= 1:
         return [float(time) for time in times], source
-    logger.info("%s: %s from %s to %s is mapped to times from 0 to 1", path, key, first, last)
-    return unit_times(times), source
+    words = f"{path}: {key} from {first} to {last} is mapped to times from 0 to 1"
+    if span:
+        warn(f"{words}: in this format it lies in that range.")
+    else:
+        logger.info(words)
+    return unit_times(times, (first, last)), source
 
 
 def read_calibration(
@@ -424,8 +460,8 @@ def _lens(
         for key in OTHER_LENSES:
             if keys.get(key):
                 raise _not_read(source, f"{key}={short(keys[key])}")
-        if isinstance(keys.get("camera_model"), str):
-            name = keys["camera_model"].upper()
+        if keys.get("camera_model"):
+            name = str(keys["camera_model"]).upper()
             model = _model(source, name)
         if keys.get("is_fisheye"):
             model = LensModel.FISHEYE
@@ -473,11 +509,16 @@ def _listed_distortion(source: str, keys: Mapping[str, Any]) -> Mapping[str, Any
 
 
 def _model(source: str, name: str) -> LensModel:
-    """The kind of lens for a name; unknown names count as perspective cameras."""
+    """The kind of lens for a name; unknown names count as perspective cameras, with a warning."""
     if name in FISHEYES:
         return LensModel.FISHEYE
     if any(word in name for word in OTHER_MODELS):
         raise _not_read(source, f"camera_model={name}")
+    if name not in (*PERSPECTIVES, "FOV"):
+        warn(
+            f"camera_model={short(name)} is not known: it is taken for a perspective lens with "
+            "OpenCV's coefficients. If it is none, undistort the images."
+        )
     return LensModel.FOV if name == "FOV" else LensModel.PERSPECTIVE
 
 

@@ -235,7 +235,8 @@ def test_a_sweep_is_run_alone():
 
 def test_a_sweep_looks_for_its_data_and_weights_first(tmp_path):
     place = f"hydra.sweep.dir={tmp_path / 'sweep'}"
-    done = train("-m", "sweep=rank", place, cwd=tmp_path, code=1)
+    few = ("lrm=small", "data.scene=bouncingballs,hook")
+    done = train("-m", "sweep=rank", *few, place, cwd=tmp_path, code=1)
     assert "bouncingballs does not exist" in done.stderr
     assert "xplanes download dnerf" in done.stderr
     assert "Traceback" not in done.stderr
@@ -254,7 +255,7 @@ def test_rows_and_sizes_that_a_sweep_does_not_have_are_named():
 
 
 def test_how_long_a_sweep_takes_is_said():
-    assert looked_ahead("sweep=suite").startswith("18 runs, at most 18 minutes")
+    assert looked_ahead("sweep=suite", "data.scene=dark,rig").startswith("2 runs, at most 2 min")
     assert looked_ahead("seed=0,1", "trainer.max_seconds=null").startswith("2 runs, 60000 steps")
     # Jobs refuse their own settings, and Hydra says what it cannot compose.
     assert looked_ahead("seed=0,1", "model.channels=0").startswith("2 runs, ")
@@ -320,7 +321,8 @@ def test_a_sweep_says_how_long_it_takes_and_its_jobs_go_on(scenes, tmp_path):
     tiny = (
         *("data.resolution=32", "data.train_views=10", "data.test_views=3", "data.val_views=2"),
         *("model.rays.per_batch=64", "model.rays.samples_per_batch=1024", "lrm=none"),
-        *("model.sampler.grid_resolution=12", "logger=none", f"data.root={scenes}"),
+        *("model.sampler.grid_resolution=12", "model.sampler.samples=32", "media=false"),
+        *("logger=none", f"data.root={scenes}"),
     )
     place = tmp_path / "sweep"
     given = ("-m", "sweep=mine", f"hydra.searchpath=[file://{tmp_path / 'conf'}]", *tiny)

@@ -29,6 +29,13 @@ from xplanes.synthetic.demo.write import MASKS, ensure_suite_scene
 SIDE = 24
 COUNTS = {"train": 50, "val": 10, "test": 12}
 
+SCENES = [
+    pytest.param(name, marks=[pytest.mark.slow] * name.endswith("_test")) for name in SUITE_SCENES
+]
+"""Those to tune on in every run of the tests; their twins in that of the wings."""
+
+SOME = ("deformation", "phone", "rig", "topology")
+
 
 @functools.cache
 def capture_of(name):
@@ -65,7 +72,9 @@ def times(name, split="train"):
     return [time for time, _ in capture_of(name).shots[split]]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind not in SOME)) for kind in KINDS]
+)
 def test_a_scene_to_tune_on_and_another_to_test_on(kind):
     tuning, test = both(kind)
     assert test in SUITE_SCENES
@@ -76,7 +85,7 @@ def test_a_scene_to_tune_on_and_another_to_test_on(kind):
     assert len(shapes[0] & shapes[1]) < 0.2 * min(map(len, shapes))
 
 
-@pytest.mark.parametrize("name", SUITE_SCENES)
+@pytest.mark.parametrize("name", SCENES)
 def test_every_view_shows_the_scene_within_the_picture(name):
     alpha = pictures(name)[..., 3]
     assert ((alpha > 127).mean(axis=(1, 2)) > 0.015).all()
@@ -85,7 +94,7 @@ def test_every_view_shows_the_scene_within_the_picture(name):
         assert (border > 127).mean() < 0.05
 
 
-@pytest.mark.parametrize("name", SUITE_SCENES)
+@pytest.mark.parametrize("name", SCENES)
 def test_times_and_cameras_of_the_splits(name):
     last = SUITE_SCENES[name].rig.end
     expected = np.linspace(0, last, 50)
@@ -105,7 +114,7 @@ def test_times_and_cameras_of_the_splits(name):
         assert distances.min() > 1e-3 * SUITE_SCENES[name].rig.distance
 
 
-@pytest.mark.parametrize("name", SUITE_SCENES)
+@pytest.mark.parametrize("name", SCENES)
 def test_things_move_unless_the_scene_is_static(name):
     camera = cameras(name)[5]
     first, later = (picture(name, time, camera).astype(int) for time in (0.0, 0.37))

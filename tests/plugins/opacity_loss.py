@@ -6,7 +6,7 @@ from typing import Any
 from torch import Tensor
 
 from xplanes.fields.base import RadianceField
-from xplanes.models.base import LossTerm
+from xplanes.models.base import LossTerm, ray_mean
 from xplanes.scenes.batches import Batch
 from xplanes.streams import TrainingState
 
@@ -18,4 +18,4 @@ class OpacityLoss(LossTerm):
     def value(
         self, field: RadianceField, rendering: Any, rays: Batch, state: TrainingState
     ) -> Tensor:
-        return (rendering.opacity - rays["alpha"]).square().mean()
+        return ray_mean((rendering.opacity - rays["alpha"]).square(), rays)

@@ -93,7 +93,8 @@ class BackgroundSettings(Settings):
         """
         if not self.unseen or state.step % UNSEEN_EVERY:
             return {}
-        usual = weighted_median(rays["target"], 1 - rendering.opacity.detach())
+        behind = (1 - rendering.opacity.detach()) * rays.get("weight", 1)
+        usual = weighted_median(rays["target"], behind)
         generator = state.generator(usual.device, Stream.UNSEEN)
         options = {"generator": generator, "device": usual.device}
         origins = 2 * torch.rand(UNSEEN_RAYS, 3, **options) - 1

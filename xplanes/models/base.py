@@ -222,12 +222,18 @@ class LossTerm(Settings, ABC):
 
 def colour_error(rendering: Rendering, rays: Batch) -> Tensor:
     """Mean squared error of the rays' colours. []"""
-    return (rendering.colour - rays["target"]).square().mean()
+    return ray_mean((rendering.colour - rays["target"]).square().mean(dim=1), rays)
+
+
+def ray_mean(values: Tensor, rays: Batch) -> Tensor:
+    """Mean over rays, unbiased if some pixels were preferred (``weight``). [R] -> []"""
+    weight = rays.get("weight")
+    return values.mean() if weight is None else (weight * values).mean()
 
 
 def opacity_error(rendering: Rendering, rays: Batch) -> Tensor:
     """Mean squared error of the rays' opacity against the images' alpha. []"""
-    return (rendering.opacity - rays["alpha"]).square().mean()
+    return ray_mean((rendering.opacity - rays["alpha"]).square(), rays)
 
 
 def background_opacity(rendering: Rendering, rays: Batch) -> Tensor:
@@ -235,7 +241,7 @@ def background_opacity(rendering: Rendering, rays: Batch) -> Tensor:
 
     Its gradient does not vanish with the opacity, so that faint floaters are removed, too.
     """
-    return (rendering.opacity * (rays["alpha"] == 0)).mean()
+    return ray_mean(rendering.opacity * (rays["alpha"] == 0), rays)
 
 
 def opacity_shortfall(rendering: Rendering, rays: Batch) -> Tensor:
@@ -246,7 +252,7 @@ def opacity_shortfall(rendering: Rendering, rays: Batch) -> Tensor:
     """
     background = rays["background"]
     gap = (rays["target"] - background).abs() / torch.maximum(background, 1 - background)
-    return (gap.amax(dim=-1) - rendering.opacity).relu().square().mean()
+    return ray_mean((gap.amax(dim=-1) - rendering.opacity).relu().square(), rays)
 
 
 def warm_cosine(step: int, progress: float, *, warmup: int, final: float) -> float:

@@ -11,6 +11,7 @@ from xplanes.backend import memory_left
 from xplanes.errors import ConfigError
 from xplanes.scenes.cameras import turned
 from xplanes.scenes.frame import Frame
+from xplanes.scenes.importance import CANDIDATES, Tiles, preferred
 from xplanes.scenes.pools import PixelPools, RunPools
 from xplanes.scenes.silhouettes import changing, foreground, plain
 from xplanes.scenes.store import RUN, StoredImages
@@ -77,12 +78,13 @@ class Batches(ABC):
         )
 
     @abstractmethod
-    def draw(self, step: int, rays: int | None = None) -> Batch:
+    def draw(self, step: int, rays: int | None = None, errors: Tensor | None = None) -> Batch:
         """The batch of a step.
 
         Args:
             step: Its number.
             rays: Number of rays to draw; the maximum when None.
+            errors: Errors by tile, for importance sampling (`ErrorMap.errors`); None for none.
         """
 
 
@@ -134,6 +136,9 @@ class RaySettings(BatchSettings):
     skip_background: bool  # Sample more rays near silhouettes, on texture and where images change.
     background_share: Share  # Share of rays far from silhouettes.
     background_jitter: Share  # Maximum random time offset of these rays.
+    # Share of rays that are drawn in proportion to the error of the field where their pixels lie.
+    # Weights in the loss make up for it. For images in memory; 0: none.
+    error_share: Share = 0.0
 
     def on(self, device: torch.device) -> "RaySettings":
         if device.type == "cpu":
@@ -197,7 +202,7 @@ class ViewBatches(Batches):
         self.background = settings.background
         self.rays = max(1, views.pixels // len(views))
 
-    def draw(self, step: int, rays: int | None = None) -> Batch:
+    def draw(self, step: int, rays: int | None = None, errors: Tensor | None = None) -> Batch:
         """The view of a step.
 
         Returns:
@@ -249,22 +254,25 @@ class RayBatches(Batches):
         slopes: Whether batches have ``view``, the index of each ray's view, int64 [R]; ``across``,
             the changes of its direction by one pixel to the right and down, [R, 2, 3]; and
             ``slopes``, those of the target colour by smoothed differences (Sobel), [R, 3, 2].
+        tiles: Tiles of the images by which rays are preferred; None without importance sampling.
     """
 
     slopes = False
+    tiles: Tiles | None = None
 
     def __init__(
         self, views: Views, frame: Frame, settings: RaySettings, *, seed: int, rank: int = 0
     ) -> None:
         self.views, self.frame = views, frame
         self.rays, self.seed, self.rank = settings.most, seed, rank
-        self.background = settings.background
+        self.background, self.error_share = settings.background, settings.error_share
         widths = views.intrinsics.size[:, 1].tolist()
         margins = [max(1, round(NEAR_SILHOUETTE * width)) for width in widths]
         changes = None
         if isinstance(views.images, StoredImages):
             self.pools = RunPools(views, views.images, margins)
         else:
+            self.tiles = Tiles.of(views) if self.error_share else None
             if settings.skip_background and views.is_opaque:
                 changes = changing(views, margins)  # Large captures are sampled uniformly.
             skips_plain = settings.skip_background and changes is None
@@ -295,26 +303,30 @@ class RayBatches(Batches):
             )
         self.slopes = True
 
-    def draw(self, step: int, rays: int | None = None) -> Batch:
+    def draw(self, step: int, rays: int | None = None, errors: Tensor | None = None) -> Batch:
         """The batch of a step.
 
         Args:
             step: Its number.
             rays: Number of rays to draw; the maximum when None.
+            errors: As in `Batches.draw`; unused without `tiles`.
 
         Returns:
             ``origins`` and unit ``directions`` in the field's frame [R, 3], ``times`` [R],
             ``target`` colour on ``background`` [R, 3] each, its ``alpha`` [R], and ``jitter``
-            from 0 to 1 [R]. More with `slopes`.
+            from 0 to 1 [R]. With `tiles`, also ``tile``, the number of each pixel's tile, int64
+            [R], and with ``errors`` the rays' ``weight`` in the loss [R]. More with `slopes`.
         """
         rays = rays or self.rays
+        errors = None if self.tiles is None else errors
         generator = step_generator(self.seed, step, self.rank)
-        uniform = torch.rand(rays, 3, generator=generator, dtype=torch.float64)
+        candidates = rays if errors is None else CANDIDATES * rays
+        uniform = torch.rand(candidates, 3, generator=generator, dtype=torch.float64)
         if isinstance(self.views.images, StoredImages):
             self._prefetch(step, rays)
-            drawn = self._from_files(self.views.images, uniform, generator)
+            drawn, more = self._from_files(self.views.images, uniform, generator), {}
         else:
-            drawn = self._from_memory(self.views.images, uniform)
+            drawn, more = self._from_memory(self.views.images, uniform, rays, errors)
         shape = (rays, 3)
         if self.background == "random":
             background = torch.rand(shape, generator=generator)
@@ -325,7 +337,7 @@ class RayBatches(Batches):
         move = None
         if self.background_jitter:
             move = torch.rand(rays, generator=generator)
-        return self._served(drawn, background, move, uniform[:, 2].float())
+        return more | self._served(drawn, background, move, uniform[:rays, 2].float())
 
     def _served(
         self, drawn: tuple[Tensor, ...], background: Tensor, move: Tensor | None, jitter: Tensor
@@ -369,13 +381,29 @@ class RayBatches(Batches):
         slopes = slopes[:, :3] - background[..., None] * slopes[:, 3:]
         return {"view": view, "across": across, "slopes": slopes}
 
-    def _from_memory(self, images: Tensor, uniform: Tensor) -> tuple[Tensor, ...]:
-        """Whether far, view, row, column and colour of independently drawn pixels. [R], [R, 4]"""
+    def _from_memory(
+        self, images: Tensor, uniform: Tensor, rays: int, errors: Tensor | None
+    ) -> tuple[tuple[Tensor, ...], Batch]:
+        """Pixels drawn independently, or by their tiles' errors, from more uniform numbers.
+
+        Returns:
+            Whether far, view, row, column and colour [R] and [R, 4], and ``tile`` and ``weight``.
+        """
         assert isinstance(self.pools, PixelPools)
         far, pixel = self.pools.pick(uniform[:, 0], uniform[:, 1])
         height, width = self.views.height, self.views.width
-        view, row, column = pixel // (height * width), pixel // width % height, pixel % width
-        return far, view, row, column, images.view(-1, 4)[pixel]
+        place = pixel // (height * width), pixel // width % height, pixel % width
+        more: Batch = {}
+        if self.tiles is not None:
+            more["tile"] = self.tiles.number(*place)
+        if errors is not None:
+            offset = uniform[-1, 2]  # The jitter of rays uses only the first of these numbers.
+            candidates = errors[more["tile"]]
+            chosen, weight = preferred(candidates, self.error_share, rays, offset)
+            more = {"tile": more["tile"][chosen], "weight": weight}
+            far, pixel = far[chosen], pixel[chosen]
+            place = tuple(each[chosen] for each in place)
+        return (far, *place, images.view(-1, 4)[pixel]), more
 
     def _from_files(
         self, images: StoredImages, uniform: Tensor, generator: torch.Generator
@@ -443,19 +471,21 @@ class DeviceBatches(RayBatches):
             return False
         return views.nbytes < LARGEST_SHARE * memory_left(device)
 
-    def draw(self, step: int, rays: int | None = None) -> Batch:
+    def draw(self, step: int, rays: int | None = None, errors: Tensor | None = None) -> Batch:
         rays = rays or self.rays
-        shape = (rays, 7)
+        errors = None if self.tiles is None else errors
+        shape = (rays if errors is None else CANDIDATES * rays, 7)
         uniform = counted_uniform(self.seed, step, self.rank, shape, self.device)
         assert isinstance(self.views.images, Tensor)
-        drawn = self._from_memory(self.views.images, uniform)
+        drawn, more = self._from_memory(self.views.images, uniform, rays, errors)
+        uniform = uniform[:rays]
         background = uniform[:, 3:6].float()
         if self.background == "one":
             background = background[:1].expand(rays, 3)
         elif self.background == "white":
             background = torch.ones_like(background)
         move = uniform[:, 6].float() if self.background_jitter else None
-        return self._served(drawn, background, move, uniform[:, 2].float())
+        return more | self._served(drawn, background, move, uniform[:, 2].float())
 
 
 def _per_run(rays: int) -> int:

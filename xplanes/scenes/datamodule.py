@@ -83,6 +83,12 @@ class SceneDataModule(LightningDataModule):
         module = None if self.trainer is None else self.trainer.lightning_module
         return getattr(module, "rays", None)
 
+    @property
+    def errors(self) -> Tensor | None:
+        """Errors by tile, if the LightningModule sets them (``errors``), see `Batches.draw`."""
+        module = None if self.trainer is None else self.trainer.lightning_module
+        return getattr(module, "errors", None)
+
     @classmethod
     def of(cls, scene: Scene, *, seed: int = 0) -> "SceneDataModule":
         """Build from a loaded scene of any source.
@@ -288,7 +294,7 @@ class _Endless(IterableDataset):
         while True:
             step = self.data.first
             self.data.first += 1
-            yield self.batches.draw(step, self.data.rays)
+            yield self.batches.draw(step, self.data.rays, self.data.errors)
 
 
 class _WholeViews(Dataset):

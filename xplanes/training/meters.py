@@ -152,8 +152,9 @@ def batch_values(rendering: Rendering, rays: Batch, loss: Tensor) -> dict[str, T
     values = {name: getattr(samples, name) for name in ("candidates", "empty", "occluded")}
     values |= {"samples": samples.count, "batches": 1, "all_rays": count, "loss": loss}
     values["rays"] = count if shown is None else shown.sum()
-    error = (rendering.colour - rays["target"]).square()
-    values["error"] = error.mean() if shown is None else masked_mean(error.mean(dim=1), shown)
+    error = (rendering.colour - rays["target"]).square().mean(dim=1)
+    error = error * rays.get("weight", 1)
+    values["error"] = error.mean() if shown is None else masked_mean(error, shown)
     return values
 
 

@@ -22,6 +22,7 @@ from xplanes.rendering.base import Renderer, Rendering
 from xplanes.rendering.sampler import Sampler, Site
 from xplanes.scenes.batches import Batch, BatchSettings
 from xplanes.scenes.frame import Frame
+from xplanes.scenes.importance import REFRESH, ErrorMap
 from xplanes.scenes.views import Scene
 from xplanes.streams import TrainingState
 from xplanes.training.building import (
@@ -47,6 +48,9 @@ from xplanes.training.scores import ViewScoring
 
 PATIENCE = 20
 """Training fails after this many consecutive updates with a loss or gradient that is not finite."""
+
+IMPORTANCE_FROM = 300
+"""Batches before rays are preferred where errors are large; earlier all errors are."""
 
 OPACITIES = 5
 """Batches between measurements of the rays' opacity."""
@@ -96,6 +100,7 @@ class RadianceModule(ViewScoring):
         """Whether no accumulated gradients are pending (see ``accumulate_grad_batches``)."""
         self.scores = []
         self.tally = Tally()
+        self.error_map = ErrorMap()
         self._parts: Parts | None = None
         self._seen: tuple[Rendering, dict[str, Tensor]] | None = None
         self._losses: list[Tensor] = []
@@ -297,6 +302,7 @@ class RadianceModule(ViewScoring):
         self._losses.append(loss.detach())
         self._seen = rendering, terms
         self.batches += 1
+        self._map_errors(rendering, batch)
         self.between_updates = False
         self._count(rendering, batch, loss)
         log_terms(self, terms, state)
@@ -342,6 +348,26 @@ class RadianceModule(ViewScoring):
     def on_train_end(self) -> None:
         self._read_tally()
 
+    @property
+    def errors(self) -> Tensor | None:
+        """Errors by tile, for importance sampling of the next batch's rays; None for none."""
+        mapped = self.batches >= self.site.steps(IMPORTANCE_FROM)
+        return self.error_map.errors if mapped else None
+
+    def _map_errors(self, rendering: Rendering, batch: Batch) -> None:
+        if (tile := batch.get("tile")) is None:
+            return
+        error = (rendering.colour.detach() - batch["target"]).square().mean(dim=1)
+        self.error_map.observe(tile, error)
+        if self.batches % REFRESH == 0:
+            self.error_map.update(self._total)
+
+    def _total(self, values: Tensor) -> Tensor:
+        """Sum over all processes, on all of them."""
+        if self.trainer.world_size > 1:
+            torch.distributed.all_reduce(values)
+        return values
+
     def _count(self, rendering: Rendering, rays: Batch, loss: Tensor) -> None:
         """Add the statistics of a batch; the host reads them later."""
         # With a learnt background it is unknown which pixels are opaque or empty.
@@ -381,6 +407,7 @@ class RadianceModule(ViewScoring):
         device, optimizer = self.device, self._optimizer
         self._adopt(self.parts.stronger())
         self.restarts += 1
+        self.error_map = ErrorMap()
         self.to(device)
         fresh = [*self.model.groups(), *self.sampler.groups()]
         for group, new in zip(optimizer.param_groups, fresh, strict=True):
@@ -395,6 +422,7 @@ class RadianceModule(ViewScoring):
         own = {"batches": self.batches, "rays": self.rays, "restarts": self.restarts}
         checkpoint["xplanes"] = __version__
         checkpoint["progress"] = own | self.tally.state_dict()
+        checkpoint["error_map"] = self.error_map.state_dict()
         if self._parts is not None:
             checkpoint["site"] = site_content(self._parts)
 
@@ -413,6 +441,8 @@ class RadianceModule(ViewScoring):
             self.restarts = progress["restarts"]
             self.batches, self.rays = progress["batches"], progress["rays"]
             self.tally.load_state_dict(progress)
+            if "error_map" in checkpoint:  # Absent in those of earlier versions.
+                self.error_map.load_state_dict(checkpoint["error_map"])
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigError(
                 f"the checkpoint cannot be used ({type(error).__name__}: {error}): it is damaged, "

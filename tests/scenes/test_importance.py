@@ -1,0 +1,185 @@
+"""Importance sampling of rays: unbiased, repeatable, and drawn to where errors are large."""
+
+import math
+
+import pytest
+import torch
+
+from tests import fake_device
+from tests.balls import ball_views
+from tests.scenes.test_batches import VIEWS, batches_of, same
+from xplanes.scenes import importance
+from xplanes.scenes.batches import DeviceBatches
+from xplanes.scenes.importance import (
+    CANDIDATES,
+    KEPT,
+    LEAST,
+    MOST_TILES,
+    ErrorMap,
+    Tiles,
+    preferred,
+)
+
+CPU = torch.device("cpu")
+
+
+def map_of(tiles: Tiles, values: dict[int, float]) -> torch.Tensor:
+    """Errors by tile: 0.1, but for some."""
+    errors = torch.full((MOST_TILES,), 0.1)
+    for tile, value in values.items():
+        errors[tile] = value
+    return errors
+
+
+def test_weighted_means_over_preferred_pixels_are_unbiased():
+    generator = torch.Generator().manual_seed(0)
+    errors = torch.rand(4000, generator=generator) ** 4
+    values = errors + torch.rand(4000, generator=generator)
+    offsets = (torch.arange(500, dtype=torch.float64) + 0.5) / 500
+    for share in (0.3, 0.5, 0.8):
+        found = []
+        for offset in offsets:
+            chosen, weight = preferred(errors + 1e-3, share, 1000, offset)
+            assert len(chosen) == len(weight) == 1000
+            assert (chosen.diff() >= 0).all()
+            found.append(float((weight * values[chosen]).mean()))
+        assert torch.tensor(found).mean() == pytest.approx(float(values.mean()), rel=2e-3), share
+
+
+def test_pixels_are_preferred_in_proportion_to_a_mixture_of_one_and_their_errors():
+    errors = torch.tensor([1.0, 3.0]).repeat_interleave(2000)
+    chosen, weight = preferred(errors, 0.5, 1000, torch.tensor(0.5))
+    # Errors of half and one and a half times the mean, mixed with 1: 0.75 and 1.25.
+    assert int((chosen >= 2000).sum()) == 625
+    assert torch.equal(weight.unique(), torch.tensor([1 / 1.25, 1 / 0.75]))
+
+
+def test_no_pixel_is_chosen_twice_because_of_a_single_bad_tile():
+    errors = torch.full((4000,), 1e-3)
+    errors[7] = 1e6
+    chosen, weight = preferred(errors, 0.9, 1000, torch.tensor(0.99))
+    assert int((chosen == 7).sum()) >= 1
+    assert weight.isfinite().all()
+    errors[7:1007] = 1e6
+    chosen, _ = preferred(errors, 0.5, 1000, torch.tensor(0.3))
+    assert len(chosen.unique()) == 1000
+
+
+@pytest.mark.parametrize(("count", "size"), [(3, 24), (40, 100), (300, 64)])
+def test_tiles_number_pixels_in_squares(monkeypatch, count, size):
+    monkeypatch.setattr(importance, "MOST_TILES", 500)
+    views = ball_views(count, 0.5, size=8)
+    views = views.subset(torch.arange(len(views)))
+    images = torch.zeros(len(views), size, size + 10, 4, dtype=torch.uint8)
+    object.__setattr__(views, "images", images)
+    tiles = Tiles.of(views)
+    assert len(views) * tiles.rows * tiles.columns <= 500 or tiles.side >= size + 10
+    half = tiles.side // 2
+    finer = math.ceil(size / half) * math.ceil((size + 10) / half)
+    assert tiles.side == 16 or len(views) * finer > 500
+    place = torch.tensor([[0, 0, 0], [0, tiles.side - 1, tiles.side - 1], [1, 0, 0]])
+    first, corner, other = tiles.number(*place.T).tolist()
+    assert first == corner != other
+    if size > tiles.side:
+        below = torch.tensor([[0, tiles.side, 0], [0, 0, tiles.side]])
+        assert len({first, *tiles.number(*below.T).tolist()}) == 3
+
+
+def test_rays_are_drawn_where_errors_are_large_as_a_function_of_the_step():
+    views = ball_views(5, 0.5, size=48)
+    batches, uniform = batches_of(views, error_share=0.5), batches_of(views)
+    assert batches.tiles is not None
+    assert same({k: v for k, v in batches.draw(3).items() if k != "tile"}, uniform.draw(3))
+    bad = int(batches.draw(0)["tile"][0])
+    errors = map_of(batches.tiles, {bad: 2.0})
+    drawn = batches.draw(4, 400, errors)
+    assert same(drawn, batches_of(views, error_share=0.5).draw(4, 400, errors))
+    assert not torch.equal(drawn["origins"], batches.draw(5, 400, errors)["origins"])
+    assert {len(value) for value in drawn.values()} == {400}
+    before = float((batches.draw(4, 400)["tile"] == bad).float().mean())
+    hit = drawn["tile"] == bad
+    assert float(hit.float().mean()) > 1.8 * before
+    assert float(drawn["weight"][hit].max()) < 1 < float(drawn["weight"][~hit].min())
+    # Those that are not asked to prefer any pixel do not.
+    assert same(uniform.draw(4, 400, errors), uniform.draw(4, 400))
+
+
+def test_preferred_pixels_have_their_own_colours_and_rays():
+    batches = batches_of(error_share=0.5)
+    assert batches.tiles is not None
+    drawn = batches.draw(2, 200, map_of(batches.tiles, {0: 1.0}))
+    origins, directions = (
+        torch.stack(rays).flatten(1, -2)
+        for rays in zip(*(VIEWS.camera(i).rays() for i in range(len(VIEWS))), strict=True)
+    )
+    origins, directions = batches.frame.rays(origins, directions)
+    colours = torch.stack([VIEWS.composite(i, torch.ones(3)) for i in range(len(VIEWS))])
+    for origin, direction, target in zip(
+        drawn["origins"], drawn["directions"], drawn["target"], strict=True
+    ):
+        away = (directions - direction).norm(dim=-1) + (origins - origin).norm(dim=-1)
+        assert torch.equal(colours.flatten(1, 2).flatten(0, 1)[away.argmin()], target)
+
+
+def test_preferred_rays_have_the_same_bits_on_every_device(fake_gpu):
+    batches = batches_of(error_share=0.5, background="random", background_jitter=0.1)
+    assert batches.tiles is not None
+    errors = map_of(batches.tiles, {0: 1.0, 3: 0.5})
+    here, there = DeviceBatches(batches, CPU), DeviceBatches(batches, fake_gpu)
+    errors_there = errors.to(fake_gpu)
+    with fake_device.counted() as counts:
+        drawn = there.draw(7, 64, errors_there)
+    assert counts.totals[1:] == (0, 0)
+    assert same({name: value.cpu() for name, value in drawn.items()}, here.draw(7, 64, errors))
+    assert len(drawn["times"]) == 64
+
+
+def test_the_map_holds_recent_mean_errors():
+    errors = ErrorMap()
+    errors.observe(torch.tensor([2, 2, 5]), torch.tensor([0.1, 0.3, 0.05]))
+    assert errors.errors is None
+    errors.update(lambda values: 2 * values)  # As with two processes.
+    overall = 0.45 / 3
+    expected = torch.full((MOST_TILES,), overall)
+    expected[2], expected[5] = 0.2, 0.05
+    assert torch.allclose(errors.errors, (expected + LEAST * overall).sqrt())
+    errors.observe(torch.tensor([2]), torch.tensor([0.8]))
+    errors.update(lambda values: values)
+    count = 4 * KEPT + 1
+    recent = (0.8 * KEPT + 0.8) / count
+    overall = (0.9 * KEPT + 0.8) / (6 * KEPT + 1)
+    assert float(errors.errors[2]) == pytest.approx((recent + LEAST * overall) ** 0.5)
+    assert float(errors.errors[2]) > float(errors.errors[5])
+
+
+def test_a_batch_that_is_not_finite_leaves_the_map_usable():
+    errors = ErrorMap()
+    errors.observe(torch.tensor([0, 1]), torch.tensor([torch.nan, torch.inf]))
+    errors.update(lambda values: values)
+    assert errors.errors.isfinite().all()
+    assert (errors.errors > 0).all()
+    errors.observe(torch.tensor([0, 1]), torch.tensor([0.5, 0.1]))
+    errors.update(lambda values: values)
+    chosen, weight = preferred(errors.errors[: CANDIDATES * 8], 0.5, 8, torch.tensor(0.2))
+    assert weight.isfinite().all()
+    assert len(chosen) == 8
+
+
+def test_a_map_continues_from_a_checkpoint_to_the_same_bits():
+    errors, again = ErrorMap(), ErrorMap()
+    generator = torch.Generator().manual_seed(1)
+    for step in range(6):
+        tile = torch.randint(0, 50, (30,), generator=generator)
+        error = torch.rand(30, generator=generator)
+        errors.observe(tile, error)
+        if step in (1, 4):
+            errors.update(lambda values: values)
+        if step == 2:
+            again.load_state_dict({k: v.clone() if torch.is_tensor(v) else v
+                                   for k, v in errors.state_dict().items()})  # fmt: skip
+        if step > 2:
+            again.observe(tile, error)
+            if step == 4:
+                again.update(lambda values: values)
+    assert torch.equal(errors.errors, again.errors)
+    assert torch.equal(errors.state_dict()["sums"], again.state_dict()["sums"])

@@ -1,0 +1,65 @@
+"""Importance sampling in training: from its first step on, resumed, and only where it is wanted."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.training.runs import checkpoint, small_config
+from xplanes.run import run
+from xplanes.training import module
+from xplanes.training.module import RadianceModule
+
+
+@pytest.fixture
+def soon(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, bool]]:
+    """Importance sampling from the fourth batch on; batches and whether their rays are weighted."""
+    monkeypatch.setattr(module, "IMPORTANCE_FROM", 3)
+    monkeypatch.setattr(module, "REFRESH", 3)
+    drawn: list[tuple[int, bool]] = []
+    step = RadianceModule.training_step
+
+    def noted(self: RadianceModule, batch, batch_idx):
+        drawn.append((self.batches, "weight" in batch))
+        if "weight" in batch:
+            assert len(batch["weight"]) == len(batch["times"])
+            assert float(batch["weight"].mean()) == pytest.approx(1, abs=0.3)
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(RadianceModule, "training_step", noted)
+    return drawn
+
+
+def test_rays_are_weighted_from_its_first_batch_on_and_a_resumed_run_draws_the_same(
+    scenes: Path, tmp_path: Path, soon: list[tuple[int, bool]]
+) -> None:
+    for steps in (5, 11):
+        config = small_config(scenes, "model.final_lr=1.0", f"trainer.max_steps={steps}")
+        run(config, tmp_path / "parts", [], resume=steps > 5)
+    assert soon == [(batch, batch >= 3) for batch in range(11)]
+    run(config, tmp_path / "whole", [], resume=False)
+    parts, whole = checkpoint(tmp_path / "parts"), checkpoint(tmp_path / "whole")
+    for name, value in whole["state_dict"].items():
+        assert torch.equal(value, parts["state_dict"][name]), name
+    assert torch.equal(whole["error_map"]["sums"], parts["error_map"]["sums"])
+    assert whole["error_map"]["sums"][:, 1].sum() > 0
+
+
+@pytest.mark.parametrize("override", ["model.rays.error_share=0", "recipe=fair"])
+def test_without_it_no_ray_is_weighted(
+    scenes: Path, tmp_path: Path, soon: list[tuple[int, bool]], override: str
+) -> None:
+    run(small_config(scenes, override, "trainer.max_steps=5"), tmp_path, [], resume=False)
+    assert soon == [(batch, False) for batch in range(5)]
+    assert checkpoint(tmp_path)["error_map"]["sums"].numel() == 0
+
+
+def test_a_checkpoint_without_a_map_is_read(
+    scenes: Path, tmp_path: Path, soon: list[tuple[int, bool]]
+) -> None:
+    run(small_config(scenes, "trainer.max_steps=4"), tmp_path, [], resume=False)
+    path = tmp_path / "checkpoints" / "last.ckpt"
+    content = checkpoint(tmp_path)
+    del content["error_map"]
+    torch.save(content, path)
+    assert RadianceModule.load_from_checkpoint(path).errors is None

@@ -1,0 +1,136 @@
+"""Importance sampling of rays: more of them where images are not reproduced yet."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from xplanes.scenes.views import Views
+
+MOST_TILES = 2**17
+"""Largest number of tiles, over all images."""
+
+SIDE = 16
+"""Side of a tile in pixels, doubled until there are few enough tiles."""
+
+CANDIDATES = 4
+"""Pixels from which each ray is chosen; no pixel is preferred more than this many times."""
+
+REFRESH, KEPT = 50, 0.84
+"""Batches between updates of the errors in use, and the weight that older batches keep."""
+
+LEAST = 0.02
+"""Least error of a tile, relative to the mean: errors of dark tiles are underestimated."""
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Square tiles of all images, numbered; the colour error is averaged over each.
+
+    Attributes:
+        side: Pixels along a side.
+        rows: Tiles along the height of the largest image.
+        columns: Tiles along its width.
+    """
+
+    side: int
+    rows: int
+    columns: int
+
+    @classmethod
+    def of(cls, views: Views) -> "Tiles":
+        """Tiles of the smallest side for which there are at most `MOST_TILES`, if possible."""
+        side = SIDE
+        while len(views) * _tiles(views, side) > MOST_TILES and side < views.width:
+            side *= 2
+        return cls(side, math.ceil(views.height / side), math.ceil(views.width / side))
+
+    def number(self, view: Tensor, row: Tensor, column: Tensor) -> Tensor:
+        """Number of the tile of each pixel. int64 [R] each -> int64 [R]"""
+        tile = (view * self.rows + row // self.side) * self.columns + column // self.side
+        return tile % MOST_TILES
+
+
+def preferred(errors: Tensor, share: float, count: int, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Choose pixels in proportion to a mixture of 1 and their errors (systematic resampling).
+
+    Args:
+        errors: Error of each candidate's tile. [N]
+        share: Share of the pixels that are chosen in proportion to their errors.
+        count: Number of pixels to choose.
+        offset: Uniform random number from 0 to 1. []
+
+    Returns:
+        Indices of the chosen candidates, ascending, int64 [count], and the weights that make means
+        over them unbiased: the inverse of how much each was preferred. [count]
+    """
+    chance = share * errors / errors.mean() + (1 - share)
+    ends = chance.clamp_max(len(errors) / count).double().cumsum(dim=0)
+    places = torch.arange(count, dtype=torch.float64, device=errors.device) + offset
+    chosen = torch.searchsorted(ends, places * (ends[-1] / count)).clamp_max_(len(errors) - 1)
+    chance = ends.diff(prepend=ends.new_zeros(1))[chosen]
+    return chosen, (ends[-1] / len(errors) / chance).float()
+
+
+def _tiles(views: Views, side: int) -> int:
+    """Number of tiles of an image."""
+    return math.ceil(views.height / side) * math.ceil(views.width / side)
+
+
+class ErrorMap:
+    """Recent mean colour error of each tile, for `preferred`.
+
+    Attributes:
+        errors: Square root of each tile's mean squared error; that of all tiles where unknown. None
+            before the first update. [MOST_TILES]
+    """
+
+    def __init__(self) -> None:
+        self.errors: Tensor | None = None
+        self._sums = torch.zeros(0)
+        """Squared errors and their number: until the last update over all processes, and since
+        then in this one; empty before the first batch. [2, 2, MOST_TILES]"""
+
+    def observe(self, tile: Tensor, error: Tensor) -> None:
+        """Add the squared errors of a batch. int64 [R], [R]"""
+        if not len(self._sums):
+            self._sums = torch.zeros(2, 2, MOST_TILES)
+        if self._sums.device != error.device:
+            self._sums = self._sums.to(error.device)
+        _, fresh = self._sums
+        fresh[0].index_add_(0, tile, error)
+        fresh[1].index_add_(0, tile, torch.ones_like(error))
+
+    def update(self, total: Callable[[Tensor], Tensor]) -> None:
+        """Bring the errors in use up to date.
+
+        Args:
+            total: Sums a tensor over all processes.
+        """
+        recent, fresh = self._sums
+        # A batch that is not finite must not remain in the sums.
+        recent = (KEPT * recent + total(fresh)).nan_to_num(0.0, 0.0, 0.0)
+        self._sums = torch.stack([recent, torch.zeros_like(recent)])
+        self.errors = self._errors()
+
+    def _errors(self) -> Tensor:
+        error, count = self._sums[0]
+        overall = error.sum() / count.sum().clamp_min(1) + torch.finfo(error.dtype).tiny
+        mean = torch.where(count > 0, error / count.clamp_min(1e-6), overall)
+        return (mean + LEAST * overall).sqrt()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Its content, for a checkpoint."""
+        return {"sums": self._sums, "updated": self.errors is not None}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from the content of a checkpoint.
+
+        Raises:
+            KeyError, TypeError: If the content is of another kind.
+        """
+        self._sums = state["sums"]
+        self.errors = self._errors() if state["updated"] else None

@@ -17,7 +17,7 @@ pytest.importorskip("trimesh")
 pytest.importorskip("skimage")
 
 OF_THE_LRM = ("lrm=", "model.channels", "model.decoder")
-SHORT = [text for text in SMALL if not text.startswith(OF_THE_LRM)]
+SHORT = [*(text for text in SMALL if not text.startswith(OF_THE_LRM)), "preparation.frames=6"]
 
 
 @pytest.fixture
@@ -39,7 +39,13 @@ def check_outputs(folder: Path) -> None:
 
 
 def test_the_script_runs(settings: None, tmp_path: Path) -> None:
-    done = inside.run(str(EXAMPLES / "first_minute.py"), cwd=tmp_path)
+    text = (EXAMPLES / "first_minute.py").read_text(encoding="utf-8")
+    for long, short in (('"320"', '"64"'), ('"--times", "8"', '"--times", "8", *COARSE')):
+        assert text.count(long) == 1
+        text = text.replace(long, short)
+    script = tmp_path / "first_minute.py"
+    script.write_text(f'COARSE = "--resolution", "32"\n{text}', encoding="utf-8")
+    done = inside.run(str(script), cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert f"open {Path('outputs', 'first_minute', 'web', 'index.html')}" in done.stdout
     check_outputs(tmp_path)

@@ -559,6 +559,7 @@ ADDRESSED = {
     "mkdocs.yml": {"site_url: ": "{Documentation}/", "repo_url: ": "{Repository}"},
     "CITATION.cff": {"repository-code: ": "{Repository}", "\nurl: ": "{Documentation}"},
     "README.md": {"  url = {": "{Repository}"},
+    "docs/index.md": {"git clone ": "{Repository}"},
     "conf/hydra/help/train.yaml": {"Manual +": "{Documentation}/configuration/"},
 }
 """Files with addresses of the project: what stands before one, and the address."""

@@ -19,8 +19,13 @@ from tests.warm import forked
 from xplanes.cli import main
 from xplanes.config import CONF, compose_plain
 from xplanes.errors import ConfigError, SceneError
+from xplanes.evaluation.render import FRAMES
+from xplanes.evaluation.report import estimated
 from xplanes.launch import prepare
+from xplanes.run import prepare as prepare_run
 from xplanes.run import run
+from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.training.fit import Estimate
 from xplanes.training.logs import forget_later
 from xplanes.training.module import RadianceModule
 
@@ -297,6 +302,20 @@ def test_arguments_of_lightnings_trainer_and_its_callbacks_work(extra, scenes, t
     run(compose_plain("train", [*SMALL, *short, *extra]), tmp_path / "run", [], resume=False)
     content = metrics(tmp_path / "run")
     assert content["step"] == (1 if "fast" in extra[0] else 3)
+
+
+def test_the_estimate_counts_every_image_as_the_field_is_when_it_is_drawn(scenes, tmp_path):
+    changes = ("media=true", "trainer.max_steps=170", "callbacks.evaluation.at=[0,0.5]")
+    experiment = prepare_run(small_config(scenes, *changes), tmp_path).experiment
+    data = SceneDataModule(experiment.data, seed=0)
+    data.setup("fit")
+    expected = Estimate(step=0.5, first_ray=5.0, later_ray=1.0, pruned_at=1000)
+    assert [expected.ray(step) for step in (0, 85, 170, 1000)] == [5, 3, 2, 1]
+    validated, tested, video = 2 * 32**2, 3 * 32**2, FRAMES * 32**2
+    images = validated * (5 + 3 + 2) + tested + video
+    said = estimated(experiment, data, expected, 7.0)
+    parts = f"7 s so far, 85 s of training, {images} s of scores and images"
+    assert said == f"{7 + 85 + images} s in all: {parts}"
 
 
 def test_a_run_says_at_its_ends_what_it_takes_and_what_comes_next(scenes, tmp_path, capsys):

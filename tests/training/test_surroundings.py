@@ -122,9 +122,9 @@ def test_time_planes_wait_as_long_as_light_that_passes_the_cube_costs():
     assert priceless.rate_of("time", 150, 0.1) == priceless.rate_of("space", 150, 0.1)
 
 
-def test_few_views_are_scored_before_surroundings_and_none_at_first():
+def test_few_views_are_scored_before_surroundings_and_none_soon_after_the_first_step():
     at = [0.0, 0.05, 0.1, 0.7]
-    assert affordable(at, 1.0, surrounded=True) == ([0.1, 0.7], 4)
+    assert affordable(at, 1.0, surrounded=True) == ([0.0, 0.1, 0.7], 2)
     for limit, surrounded in ((1.0, False), (7, True), (1, True), (0.5, True)):
         assert affordable(at, limit, surrounded) == (at, limit)
 

@@ -153,7 +153,12 @@ FRAMES, FPS = 48, 16
 """Number of frames of a run's video, and frames per second."""
 
 VIDEO_SIZE = 200
-"""Pixels of the longer side of a run's own video."""
+"""Most pixels along the sides of a run's own video."""
+
+
+def video_size(views: Views) -> int:
+    """Pixels along each side of the video of a run that trains on some views."""
+    return min(VIDEO_SIZE, max(views.height, views.width))
 
 
 def back_and_forth(count: int) -> Tensor:
@@ -165,7 +170,7 @@ def write_orbit(module: RadianceModule, scene: Scene, run: Path) -> Path:
     """Write media/orbit.webp: one camera orbit while time runs from 0 to 1 and back."""
     views, frame = scene.splits["train"], module.frame
     assert frame is not None
-    size = min(VIDEO_SIZE, max(views.height, views.width))
+    size = video_size(views)
     focal = views.intrinsics.focal_at(size)
     cameras = [PosedCamera(p, focal, size, size) for p in orbit_poses(views, frame, FRAMES)]
     path = cameras, back_and_forth(FRAMES)

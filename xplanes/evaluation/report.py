@@ -14,7 +14,7 @@ from torch.utils.tensorboard.summary import hparams
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from xplanes import __version__, backend
-from xplanes.evaluation.render import FRAMES, VIDEO_SIZE
+from xplanes.evaluation.render import FRAMES, video_size
 from xplanes.experiment import Experiment
 from xplanes.process import resume_command
 from xplanes.rendering.pictures import write_png
@@ -92,22 +92,19 @@ def estimated(
     trainer = experiment.trainer
     steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
     train = min(steps * expected.step, trainer.get("max_seconds") or math.inf)
-    pruned = expected.pruned_at * expected.step / train
     final = data.scene.splits[data.test_split]
     views = data.scene.splits[data.validation_split or data.test_split]
     at = experiment.callbacks.get("evaluation", {}).get("at", [])
     limit = trainer.get("limit_val_batches", 1.0)
     at, limit = affordable(at, limit, data.scene.is_surrounded)
-    shares = {*at, 1.0}
-    early = sum(share == 0 or share < pruned for share in shares)
     count = scored_views(limit, len(views))
     pixels = views.height * views.width * count
-    later = pixels * (len(shares) - early)
+    steps_at = [share * train / expected.step if share else 0.0 for share in {*at, 1.0}]
+    images = sum(pixels * expected.ray(step) for step in steps_at)
     if final is not views or count < len(views):
-        later += final.height * final.width * len(final)
+        images += final.height * final.width * len(final) * expected.later_ray
     if experiment.media:
-        later += FRAMES * VIDEO_SIZE**2
-    images = early * pixels * expected.first_ray + later * expected.later_ray
+        images += FRAMES * video_size(data.scene.splits["train"]) ** 2 * expected.later_ray
     parts = f"{spent:.0f} s so far, {{}} of training, {images:.0f} s of scores and images"
     if train == math.inf:
         return parts.format("no end")

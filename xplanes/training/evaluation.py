@@ -21,9 +21,8 @@ from xplanes.training.scores import mean
 SHOWN = 4
 """Number of views whose images are logged at each evaluation."""
 
-
-FEW_VIEWS, FIRST_SHARE = 4, 0.1
-"""Defaults in scenes with surroundings: number of views, and earliest share of the budget."""
+FEW_VIEWS, FIRST_SHARE = 2, 0.1
+"""Defaults in scenes with surroundings: number of views, and least share of the budget above 0."""
 
 CURVE = ("seconds", "step", "split", "psnr", "ssim")
 """Columns of curve.csv."""
@@ -35,7 +34,7 @@ def affordable(
     """Shares of the budget at which to evaluate, and limit on the number of views.
 
     In scenes with surroundings the whole cube may be occupied at first, and a view takes seconds to
-    render: by default fewer views are scored, and none before empty space is pruned.
+    render: by default fewer views are scored, and after step 0 none until surfaces are opaque.
 
     Args:
         at: Shares of the budget at which to evaluate.
@@ -44,7 +43,7 @@ def affordable(
     """
     if not surrounded or limit != 1.0 or isinstance(limit, int):
         return list(at), limit
-    return [share for share in at if share >= FIRST_SHARE], FEW_VIEWS
+    return [share for share in at if share == 0 or share >= FIRST_SHARE], FEW_VIEWS
 
 
 class Evaluation(Callback):

@@ -250,9 +250,9 @@ class Estimate(NamedTuple):
     """Expected durations, measured before the first step.
 
     Attributes:
-        step: Seconds per step.
-        first_ray: Seconds per ray of an image before empty space is pruned.
-        later_ray: Seconds per ray afterwards.
+        step: Seconds per step, once the number of rays fits the samples of a batch.
+        first_ray: Seconds per ray of an image of the untrained field.
+        later_ray: Seconds per ray once surfaces are opaque and empty space is pruned.
         pruned_at: First step at which empty space is pruned.
     """
 
@@ -261,9 +261,31 @@ class Estimate(NamedTuple):
     later_ray: float
     pruned_at: int
 
+    def ray(self, step: float) -> float:
+        """Seconds per ray of an image after a number of steps."""
+        if step >= self.pruned_at:
+            return self.later_ray
+        return self.later_ray + (self.first_ray - self.later_ray) * 0.5 ** (step / HALF_OPAQUE)
+
+
+WHOLE_STEP = 1.45
+"""A step's time, relative to that of rendering its rays and of the gradients.
+
+The rest is drawing rays, the optimiser, regularisers, the occupancy grid and Lightning's loop: a
+third of the training of the demo scene (docs/results/records/time.json).
+"""
+
+HALF_OPAQUE = 85
+"""Steps in which the extra cost of images of an untrained field halves, as surfaces become opaque.
+
+Measured on a capture with surroundings, of which no cell is pruned in the first 800 steps.
+"""
 
 OPAQUE = 1000.0
 """Factor on the density that makes an untrained field about as opaque as a trained one."""
+
+BEHIND = 0.5
+"""Assumed share of an image's rays that reach the background."""
 
 
 def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
@@ -275,7 +297,13 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
     frame, field, renderer = module.frame, module.field, module.renderer
     assert frame is not None
     device = next(field.parameters()).device
-    rays = _moved(data.batches_for(module, 0).draw(0, module.rays), device)
+    batches = data.batches_for(module, 0)
+    rays = _moved(batches.draw(0, module.rays), device)
+    if module.rays:  # Batches soon have as many rays as their samples allow.
+        with torch.no_grad():
+            samples = module.sampler.render(field, rays, module.state).samples
+        count = module.ray_settings.fitting(module.rays, int(samples.count))
+        rays = _moved(batches.draw(0, count), device)
     views = data.scene.splits[data.test_split]
     camera, seen_at = views.camera(0), (float(views.times[0]), data.scene.background.to(device))
     pixels = camera.height * camera.width
@@ -284,7 +312,7 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         module.sampler.render(field, rays, module.state).colour.sum().backward()
         module.zero_grad(set_to_none=True)
 
-    taken = _seconds(step, device)
+    taken = WHOLE_STEP * _seconds(step, device)
     if not isinstance(renderer, RayRenderer):
         ray = _seconds(lambda: renderer.view(field, frame, camera, *seen_at), device) / pixels
         return Estimate(taken, ray, ray, 0)
@@ -295,8 +323,8 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         solid = field.masked(lambda points: points.new_full(points.shape[:1], OPAQUE))
         later = _seconds(lambda: renderer.image(solid, origins, directions, *seen_at), device)
         if (background := getattr(field, "background", None)) is not None:
-            with torch.no_grad():  # The background is rendered wherever the cube is empty.
-                later += _seconds(lambda: look(background, origins, directions), device)
+            with torch.no_grad():
+                later += BEHIND * _seconds(lambda: look(background, origins, directions), device)
     return Estimate(taken, first / len(chosen), later / len(chosen), pruned_at)
 
 

@@ -400,7 +400,8 @@ def test_masks_that_nothing_names_are_told_of(capture, name):
         path = capture.path / name.format(Path(frame["file_path"]).stem)
         path.parent.mkdir(exist_ok=True)
         Image.fromarray(band()).save(path)
-    with pytest.warns(UserWarning, match=f"{name.split('{')[0].rstrip('/')}.* is not read"):
+    folder = name.partition("/")[0]
+    with pytest.warns(UserWarning, match=f"{folder}.* is not read.*data.masks={folder},"):
         assert capture.read().splits["train"].ignored is None
 
 

@@ -81,9 +81,10 @@ def warn_of_masks(folder: Path, images: Sequence[Path]) -> None:
     )
     if found:
         names = some([path.relative_to(folder).as_posix() for path in found])
+        place = found[0] if found[0].is_dir() else found[0].parent
         warn(
             f"{folder}: {names} is not read. If these are masks of the images, name their folder "
-            f"(data.masks={found[0].name}, of colmap and nerfies), or their files (mask_path of "
+            f"(data.masks={place.name}, of colmap and nerfies), or their files (mask_path of "
             "the frames in transforms files)."
         )
 

@@ -4,7 +4,7 @@ import json
 import math
 import re
 import shlex
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +67,8 @@ def inspected(model):
         usual = compose_plain(None, ["+data=blender"])["data"]
         given = {**usual, "name": "given", "scene": "ball", "resolution": None}
         given |= {"half_side": half_side, "content": scene}
-        settings = Given(**{key: value for key, value in given.items() if key != "_target_"})
+        known = {field.name for field in fields(Given)}
+        settings = Given(**{key: value for key, value in given.items() if key in known})
         return inspect(Choice((), settings, replace(model, resolution=texels)))
 
     return read

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from xplanes.fields.xplanes import XPlanes
-from xplanes.models.initialisation import Initialisation, Method, Place
+from xplanes.models.initialisation import Method, Place
 from xplanes.models.x_planes import XPlanesSettings
 from xplanes.preparation.cache import StageCache
 from xplanes.preparation.reconstruct import reconstruct
@@ -53,14 +53,12 @@ def fitted(
 ) -> TriplaneSequence:
     """A single triplane after training on the views of its timestep."""
     scene = Scene("oracle", {"train": views, "val": views.subset(torch.tensor([0]))})
-
-    def initialise(method: Method, place: Place) -> Initialisation:
-        cache = StageCache(None)
-        return from_sequence(start, method, place, cache, source="the oracle", seconds={})
-
-    module = RadianceModule(method)
-    module.build(scene, start.frame, initialise=initialise, say=lambda _: None)
     device = torch.device("cpu")
+    assert start.frame is not None
+    place = Place(scene, start.frame, device)
+    found = from_sequence(start, method, place, StageCache(None), source="the oracle", seconds={})
+    module = RadianceModule(method)
+    module.build(scene, start.frame, initialisation=found)
     fit_quietly(module, scene, folder, device=device, max_steps=steps, max_seconds=None)
     assert isinstance(module.field, XPlanes)
     planes = torch.stack(list(module.field.planes.values())).detach()

@@ -160,8 +160,9 @@ scene_of = functools.cache(ball_scene)
 def built(plain, scene):
     """The field of a configuration, random whatever its LRM, and its batches."""
     module = RadianceModule(plain)
-    module.build(scene, initialise=lambda method, place: Initialisation(method.model, place.frame))
-    views = scene.splits["train"]
+    model, views = module.method.model, scene.splits["train"]
+    frame = model.frame(views)
+    module.build(scene, frame, initialisation=Initialisation(model, frame))
     settings, seed = module.ray_settings, module.method.seed
     return module, settings.batches(views, module.frame, seed=seed, rank=0)
 

@@ -9,7 +9,6 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 from xplanes import __version__
@@ -18,8 +17,6 @@ from xplanes.process import defaults, keep_freed_memory
 
 AddCommands = Callable[["argparse._SubParsersAction"], None]
 """Adds parsers of commands; each sets ``command``, which is called with the parsed options."""
-
-say = partial(print, flush=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -30,6 +30,7 @@ ELSEWHERE = {
     "iterations": "trainer.max_steps={}",
     "device": "trainer.accelerator={}",
     "output_dir": "hydra.run.dir={}",
+    "entry": "model={}",
     "world_variation": "model.loss.total_variation_with_background={}",
     "world_time": "model.loss.time_factor_with_background={}",
     "world_threshold": "model.sampler.threshold_with_background={}",
@@ -43,13 +44,12 @@ _WORDS = ("null", "none", "true", "false", "inf", "nan")
 """Words that Hydra does not read as text unless they are quoted."""
 
 
-def compose_plain(name: str | None, overrides: Sequence[str], conf: Path = CONF) -> dict[str, Any]:
+def compose_plain(name: str | None, overrides: Sequence[str]) -> dict[str, Any]:
     """A configuration with some settings changed, resolved to builtins.
 
     Args:
         name: Its file in ``conf``, without suffix; None for an empty configuration.
         overrides: ``key=value`` each.
-        conf: The configuration folder.
 
     Raises:
         ConfigError: For a key or option that does not exist, or an override that is not a string.
@@ -62,46 +62,42 @@ def compose_plain(name: str | None, overrides: Sequence[str], conf: Path = CONF)
                 f"compose({override!r}): takes settings one by one, as "
                 'compose("model=nine_planes", "lrm=none")'
             )
-    with _hydra(conf, name, overrides):
+    with _hydra(name, overrides):
         return to_plain(compose(name, [with_names(override) for override in overrides]))
 
 
-def group_options(
-    group: str, overrides: Sequence[str] = (), name: str = "train", conf: Path = CONF
-) -> list[str]:
+def group_options(group: str, overrides: Sequence[str] = ()) -> list[str]:
     """Names of a group's options, including those from ``hydra.searchpath``.
 
     Args:
         group: The group, such as ``data``.
         overrides: ``key=value`` each.
-        name: File of the configuration in ``conf``, without ending.
-        conf: The configuration folder.
 
     Raises:
         ConfigError: For overrides that Hydra cannot read.
     """
     from hydra.core.global_hydra import GlobalHydra
 
-    with _hydra(conf, name, overrides):
+    with _hydra("train", overrides):
         loader = GlobalHydra.instance().config_loader()
-        return loader.get_group_options(group, config_name=name, overrides=list(overrides))
+        return loader.get_group_options(group, config_name="train", overrides=list(overrides))
 
 
 @contextmanager
-def _hydra(conf: Path, name: str | None, overrides: Sequence[str]) -> Iterator[None]:
+def _hydra(name: str | None, overrides: Sequence[str]) -> Iterator[None]:
     """A separate Hydra whose errors suggest names close to an unknown one."""
     from hydra.errors import HydraException
 
     try:
-        with _initialized(conf):
+        with _initialized():
             yield
     except HydraException as error:
-        near = near_names(overrides, conf, name)
+        near = near_names(overrides, name)
         raise ConfigError("\n".join(filter(None, (str(error), near)))) from error
 
 
 @contextmanager
-def _initialized(conf: Path) -> Iterator[None]:
+def _initialized() -> Iterator[None]:
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.plugins import Plugins
@@ -112,7 +108,7 @@ def _initialized(conf: Path) -> Iterator[None]:
     outer = Singleton.get_state()
     GlobalHydra.instance().clear()
     try:
-        with initialize_config_dir(str(conf), version_base="1.3"):
+        with initialize_config_dir(str(CONF), version_base="1.3"):
             yield
     finally:
         Singleton.set_state(outer)
@@ -185,13 +181,12 @@ def with_names(override: str, *, several: bool = False) -> str:
     return f"{key}={','.join(quoted(at_home(part)) for part in parts)}"
 
 
-def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "train") -> str:
+def near_names(overrides: Sequence[str], name: str | None = "train") -> str:
     """Suggestions for the first override with an unknown option or key; empty if there is none.
 
     Args:
         overrides: ``key=value`` each.
-        conf: The configuration folder.
-        name: File of the configuration in ``conf``, without ending.
+        name: File of the configuration in ``conf``, without suffix.
     """
     from hydra import compose
     from hydra.core.global_hydra import GlobalHydra
@@ -205,7 +200,7 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
             str(each.input_line) for each in parsed if each.key_or_group == "hydra.searchpath"
         ]
         keys = {}
-        with _initialized(conf):
+        with _initialized():
             loader = GlobalHydra.instance().config_loader()
             search = list(chosen)
             for each in parsed:
@@ -225,7 +220,7 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
                             named |= {f"-m sweep={sweep}": sweep for sweep in sweeps}
                         near = difflib.get_close_matches(option, named.values(), n=1)
                         meant = [each for each, name in named.items() if name in near]
-                        meant = meant or _described(conf, group, option)
+                        meant = meant or _described(group, option)
                         return f"Did you mean {' or '.join(meant)}?" if meant else ""
                 line = str(each.input_line)
                 chosen.append(f"{line.partition('=')[0]}={values[0]}" if swept else line)
@@ -239,7 +234,7 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
     key = next((key for key in keys if key not in known), None)
     if key is None:
         return ""
-    if options := _options_with(key, groups, conf):
+    if options := _options_with(key, groups):
         return f"{key} belongs to {' and '.join(options)}, which is not chosen"
     prefix, _, last = key.rpartition(".")
     if last in ELSEWHERE:
@@ -254,10 +249,10 @@ def near_names(overrides: Sequence[str], conf: Path = CONF, name: str | None = "
     return f"Did you mean {' or '.join(near)}?" if near else ""
 
 
-def _described(conf: Path, group: str, word: str) -> list[str]:
+def _described(group: str, word: str) -> list[str]:
     """Options whose first comment begins with ``word``, and the beginning of that comment."""
     found = []
-    for path in sorted((conf / group).glob("*.yaml")):
+    for path in sorted((CONF / group).glob("*.yaml")):
         words = re.match("# ([^.,:]+)", path.read_text(encoding="utf-8"))
         if words and words[1].lower().startswith(word.lower()):
             found.append(f"{group}={path.stem} ({words[1]})")
@@ -271,7 +266,7 @@ def _names(node: Any, prefix: str = "") -> Iterator[str]:
         yield from _names(value, f"{prefix}{key}.")
 
 
-def _options_with(key: str, groups: Sequence[str], conf: Path) -> list[str]:
+def _options_with(key: str, groups: Sequence[str]) -> list[str]:
     """Options of some groups whose files set a key."""
     import yaml
 
@@ -279,6 +274,6 @@ def _options_with(key: str, groups: Sequence[str], conf: Path) -> list[str]:
         f"{group}={path.stem}"
         for group in groups
         if key.startswith(prefix := f"{group.replace('/', '.')}.")
-        for path in (conf / group).glob("*.yaml")
+        for path in (CONF / group).glob("*.yaml")
         if key.removeprefix(prefix) in _names(yaml.safe_load(path.read_text(encoding="utf-8")))
     )

@@ -3,7 +3,6 @@
 For a fast start, neither torch nor lightning is imported before the job begins.
 """
 
-import re
 import shlex
 import sys
 from collections.abc import Iterable, Sequence
@@ -272,46 +271,25 @@ def _require_present_names(arguments: Sequence[str], *, several: bool) -> None:
     """Refuse options of earlier versions, and name those that replace them.
 
     Raises:
-        ConfigError: With the commands.
+        ConfigError: With the command that replaces them.
     """
-    former, commands = [], [""]
+    former, now = [], []
     for text in arguments:
         key, value = text.partition("=")[::2]
-        choices = [shlex.quote(text)]
-        if key in ("experiment", "sweep") and value in FORMER:
-            choices, several = [FORMER[value]], True
-        elif key == "experiment" and value and (CONF / "sweep" / f"{value}.yaml").is_file():
-            choices, several = [f"sweep={value}"], True
-        elif key == "scale":
-            choices = ["experiment=demo"]
-        elif key == "entry":
-            choices = _entries(value)
-            several = several or choices[0].startswith("sweep=")
-        elif text in ("-m", "--multirun"):
+        choice = same = shlex.quote(text)
+        if text in ("-m", "--multirun"):
             continue
-        if choices != [shlex.quote(text)]:
-            former.append(text)
-        commands = [f"{command} {choice}" for command in commands for choice in choices]
+        if key in ("experiment", "sweep") and value in FORMER:
+            choice, several = FORMER[value], True
+        elif key == "experiment" and value and (CONF / "sweep" / f"{value}.yaml").is_file():
+            choice, several = f"sweep={value}", True
+        elif key == "scale":
+            choice = "experiment=demo"
+        former += [text] * (choice != same)
+        now.append(choice)
     if former:
         program = f"{train_command()} -m" if several else train_command()
-        lines = "\n".join(f"  {program}{command}" for command in commands)
-        raise ConfigError(f"{' '.join(former)}: that is now\n{lines}")
-
-
-def _entries(names: str) -> list[str]:
-    """Overrides that replace options of the former group ``entry``; equal ones share a command."""
-    found: dict[str, list[str]] = {}
-    for name in names.split(","):
-        if name.startswith("ablation_"):
-            return ["sweep=ablation"]
-        model, rest = name.removesuffix("_occupancy"), ""
-        if model != name:
-            rest = " model/sampler=occupancy"
-        if planes := re.fullmatch(r"(six_planes|nine_planes)(_paper)?(_[a-z]+)?", name):
-            model, paper, lrm = planes.groups()
-            rest = (" recipe=paper" if paper else "") + (f" lrm={lrm[1:]}" if lrm else "")
-        found.setdefault(rest, []).append(model)
-    return [f"model={','.join(models)}{rest}" for rest, models in found.items()]
+        raise ConfigError(f"{' '.join(former)}: that is now\n  {program} {' '.join(now)}")
 
 
 def _require_version(run: Path) -> None:

@@ -67,6 +67,11 @@ def keep_freed_memory() -> None:
             library.mallopt(option, value)
 
 
+def say(text: str) -> None:
+    """Print a line without buffering."""
+    print(text, flush=True)
+
+
 def train_command() -> str:
     """The training command in the form in which this process was started, for messages."""
     return "python train.py" if Path(sys.argv[0]).name == "train.py" else "xplanes train"

@@ -23,9 +23,9 @@ from xplanes.experiment import Experiment
 from xplanes.files import StorageError, clear_unfinished, storage_error, write_json
 from xplanes.locks import alone_in
 from xplanes.lrm import LRMError
-from xplanes.models.initialisation import Initialisation, Place
+from xplanes.models.initialisation import Place, initialisation_of
 from xplanes.optional import MissingExtraError
-from xplanes.process import resume_command
+from xplanes.process import resume_command, say
 from xplanes.scenes.datamodule import SceneDataModule, found_root
 from xplanes.training.checkpoints import find_resumable, has_checkpoint
 from xplanes.training.clock import find_callback, training_seconds
@@ -189,15 +189,13 @@ def train(
     # Initialisation and field
     # Built before the initialisation: Lightning keeps the local variables of its caller alive.
     module = RadianceModule(method)
-    found = Initialisation(method.model, frame)
-    if source is not None:
-        place = Place(scene, frame, device, experiment.devices, say, hints)
-        found = source.initialise(method, place)
-    del source
+    place = Place(scene, frame, device, experiment.devices, say, hints)
+    found = initialisation_of(method, source, place)
+    del source  # Frees the LRM.
     began = time.perf_counter() - warm_up.seconds
-    module.build(scene, frame, device=device, initialise=lambda *_: found)
+    module.build(scene, frame, device=device, initialisation=found)
     loaded += time.perf_counter() - warm_up.seconds - began
-    found = module.initialisation or found
+    found = module.initialisation or found  # Without the sparse part, which the model frees.
     loaded -= found.seconds["fill"]  # Filling the grid of an initialised field is preparation.
 
     # Training
@@ -242,8 +240,3 @@ def train(
     logger.info("\n%s", text)
     say(text)
     return metrics
-
-
-def say(text: str) -> None:
-    """Print a line without buffering."""
-    print(text, flush=True)

@@ -1,5 +1,4 @@
 import errno
-import hashlib
 import io
 import json
 import os
@@ -141,8 +140,7 @@ def test_downloads_and_unpacks_all_scenes(tmp_path, server, monkeypatch):
     monkeypatch.setattr(download_module, "TEST_VIEWS", 20)
     server.content = make_archive(train_views=TRAIN_VIEWS, held_out=20)
     root = tmp_path / "data" / "dnerf"
-    checksum = hashlib.sha256(server.content).hexdigest().upper()
-    result, lines = download(root, server, sha256=checksum)
+    result, lines = download(root, server)
     assert result == root
     assert_complete(root, TRAIN_VIEWS)
     assert server.url in lines[0]
@@ -248,11 +246,6 @@ def test_a_changed_file_is_fetched_from_its_start(tmp_path, server):
 
 def test_damaged_archives_leave_no_scene(tmp_path, server):
     whole = server.content
-    message = error(tmp_path, server, sha256="ab" * 32)
-    assert hashlib.sha256(whole).hexdigest() in message
-    assert "ab" * 32 in message
-    assert list(tmp_path.iterdir()) == []
-
     server.content = whole[:-100]
     message = error(tmp_path, server)
     assert "dnerf.zip" in message

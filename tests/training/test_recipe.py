@@ -149,16 +149,14 @@ def module_of(*overrides: str) -> tuple[RadianceModule, torch.Tensor]:
     generator = torch.Generator().manual_seed(1)
     sparse = torch.randn(4, 3, 8, 6, 6, generator=generator)
 
-    def initialise(method, place):
-        plane_set = method.model.plane_set
-        planes = {name: torch.randn(8, 8, 8, generator=generator) for name in ("xy", "xz", "yz")}
-        for name in TIME_PLANES[plane_set]:
-            planes[name] = torch.randn(8, 3, 8, generator=generator)
-        values = InitialValues(planes, sparse=sparse)
-        return Initialisation(method.model, place.frame, values=values)
-
-    module = RadianceModule(small(*overrides))
-    module.build(ball_scene(), initialise=initialise)
+    module, scene = RadianceModule(small(*overrides)), ball_scene()
+    model = module.method.model
+    planes = {name: torch.randn(8, 8, 8, generator=generator) for name in ("xy", "xz", "yz")}
+    for name in TIME_PLANES[model.plane_set]:
+        planes[name] = torch.randn(8, 3, 8, generator=generator)
+    frame = model.frame(scene.splits["train"])
+    values = InitialValues(planes, sparse=sparse)
+    module.build(scene, frame, initialisation=Initialisation(model, frame, values=values))
     return module, sparse
 
 

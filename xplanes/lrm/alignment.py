@@ -61,13 +61,10 @@ class Mismatch:
     Attributes:
         largest: Largest distance in pixels.
         mean: Mean distance in pixels.
-        radius: Largest distance from the centre of the points considered, in the model's frame;
-            points outside the source image are left out.
     """
 
     largest: float
     mean: float
-    radius: float
 
 
 @dataclass(frozen=True)
@@ -155,22 +152,17 @@ def align(
     return Alignment(frame, view.half_side, crop, focal_mismatch(view, share, crop.side))
 
 
-def focal_mismatch(
-    view: CanonicalView, share: float, side: int, *, radius: float | None = None
-) -> Mismatch:
+def focal_mismatch(view: CanonicalView, share: float, side: int) -> Mismatch:
     """Distance between projections into source and canonical camera, after "scale" matching.
+
+    The points are those of the ball inside the model's box that the source image shows.
 
     Args:
         view: The model's own camera and box.
         share: Focal length of the source camera as a share of the crop's side.
         side: The crop's side in pixels.
-        radius: Largest distance of the points from the centre, in the model's frame; half the side
-            of the box when None.
-
-    Returns:
-        The largest and the mean distance over these points.
     """
-    reach = view.half_side if radius is None else radius
+    reach = view.half_side
     line = torch.linspace(-reach, reach, 41, dtype=torch.float64)
     right, up, back = torch.meshgrid(line, line, line, indexing="ij")
     inside = right**2 + up**2 + back**2 <= reach**2 * (1 + 1e-9)
@@ -179,4 +171,4 @@ def focal_mismatch(
     seen = lateral * share / (source_distance - back)
     predicted = lateral * view.focal / (view.distance - back)
     apart = (seen - predicted).norm(dim=0)[(seen.abs() <= 0.5).all(dim=0)] * side
-    return Mismatch(float(apart.max()), float(apart.mean()), reach)
+    return Mismatch(float(apart.max()), float(apart.mean()))

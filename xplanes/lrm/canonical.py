@@ -58,15 +58,12 @@ TRIPOSR_VIEW = CanonicalView(
 """At +x, z up. Nominal: the model has no camera input."""
 
 
-def camera_vector(
-    camera_to_world: Tensor, focal: tuple[float, float], centre: tuple[float, float] = (0.5, 0.5)
-) -> Tensor:
-    """OpenLRM's camera vector: three rows of the pose, focal lengths, principal point.
+def camera_vector(camera_to_world: Tensor, focal: tuple[float, float]) -> Tensor:
+    """OpenLRM's camera vector: three rows of the pose, focal lengths, a centred principal point.
 
     Args:
         camera_to_world: Poses in the model's frame, OpenGL camera axes. [N, 4, 4] or [N, 3, 4]
         focal: Along x and y, as shares of the image's width and height.
-        centre: Principal point, likewise.
 
     Returns:
         One vector per camera. [N, 16]
@@ -74,7 +71,7 @@ def camera_vector(
     Source: OpenLRM 1.1.
     """
     poses = camera_to_world[:, :3].flatten(1)
-    intrinsics = poses.new_tensor([*focal, *centre])
+    intrinsics = poses.new_tensor([*focal, 0.5, 0.5])
     return torch.cat([poses, intrinsics.expand(len(poses), -1)], dim=1)
 
 

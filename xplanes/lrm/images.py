@@ -62,15 +62,14 @@ def square_crop(height: int, width: int, zoom: float = 1.0) -> Crop:
     return Crop((height - side) // 2, (width - side) // 2, side)
 
 
-def foreground_crop(alpha: Tensor, ratio: float = FOREGROUND_RATIO) -> Crop:
-    """The square in which the opaque part fills ``ratio`` of the side.
+def foreground_crop(alpha: Tensor) -> Crop:
+    """The square in which the opaque part fills `FOREGROUND_RATIO` of the side.
 
     As in TripoSR, the last row and column of the opaque part are lost. For a video, pass the
     maximum of alpha over time, so that all frames share one crop.
 
     Args:
         alpha: Opacity. [H, W]
-        ratio: Share of the side.
 
     Raises:
         LRMError: If nothing, or only one row or column, is opaque.
@@ -83,7 +82,7 @@ def foreground_crop(alpha: Tensor, ratio: float = FOREGROUND_RATIO) -> Crop:
     top, bottom = int(rows.min()), int(rows.max())
     left, right = int(columns.min()), int(columns.max())
     tight = max(bottom - top, right - left)
-    side = int(tight / ratio)
+    side = int(tight / FOREGROUND_RATIO)
     margin = (side - tight) // 2
     return Crop(
         top - (tight - (bottom - top)) // 2 - margin,

@@ -102,6 +102,13 @@ class Initialiser(ABC):
         """
 
 
+def initialisation_of(method: "Method", source: Initialiser | None, place: Place) -> Initialisation:
+    """The initialisation of a field: from a source, or random if there is none."""
+    if source is None:
+        return Initialisation(method.model, place.frame)
+    return source.initialise(method, place)
+
+
 @dataclass(frozen=True, kw_only=True)
 class InitialiserSettings(Settings, ABC):
     """Base of the settings in the group ``lrm``."""

@@ -194,15 +194,12 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
             yield folder / f"{relative}{suffix}"
 
 
-def mask_files(
-    folder: Path, names: Sequence[Sequence[str]], key: str = "data.masks"
-) -> tuple[Path | None, ...]:
+def mask_files(folder: Path, names: Sequence[Sequence[str]]) -> tuple[Path | None, ...]:
     """The mask of each image; None, with a warning, for images without a mask.
 
     Args:
         folder: Folder of masks.
         names: Possible names of each image's mask without the ending, in order of preference. [V]
-        key: The setting that names the folder.
 
     Raises:
         SceneError: If no image has a mask.
@@ -212,8 +209,8 @@ def mask_files(
     bare = [f"{each[0]}.png" for each, mask in zip(names, masks, strict=True) if mask is None]
     if len(bare) == len(masks):
         raise SceneError(
-            f"{key}: {folder} {'holds' if root else 'does not exist, so there is'} no mask of any "
-            f"image, such as {bare[0]}. Put the masks there, or set {key}=null."
+            f"data.masks: {folder} {'holds' if root else 'does not exist, so there is'} no mask of "
+            f"any image, such as {bare[0]}. Put the masks there, or set data.masks=null."
         )
     if bare:
         warn(

@@ -6,8 +6,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from xplanes.cli import Command, add_table, option, say
-from xplanes.process import train_command
+from xplanes.cli import Command, add_table, option
+from xplanes.process import say, train_command
 
 if TYPE_CHECKING:
     from xplanes.tools.runs import TrainedRun

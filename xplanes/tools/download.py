@@ -1,6 +1,5 @@
 """Downloads, checks and unpacks the public D-NeRF scenes."""
 
-import hashlib
 import json
 import shutil
 import time
@@ -213,7 +212,6 @@ def download_dnerf(
     root: Path,
     *,
     url: str = DNERF_URL,
-    sha256: str | None = None,
     announce: Callable[[str], None] = print,
 ) -> Path:
     """Download the eight D-NeRF scenes into ``root``; incomplete scenes are never left there.
@@ -224,7 +222,6 @@ def download_dnerf(
     Args:
         root: Folder for one folder per scene; created if missing.
         url: Address of the archive.
-        sha256: Required checksum of the archive, in hexadecimal; None skips the comparison.
         announce: Receives progress messages.
 
     Returns:
@@ -236,14 +233,14 @@ def download_dnerf(
     """
     root = Path(root).absolute()
     try:
-        return _downloaded(root, url, sha256, announce)
+        return _downloaded(root, url, announce)
     except OSError as problem:
         if (words := storage_error(problem, root)) is None:
             raise
         raise words from problem
 
 
-def _downloaded(root: Path, url: str, sha256: str | None, announce: Callable[[str], None]) -> Path:
+def _downloaded(root: Path, url: str, announce: Callable[[str], None]) -> Path:
     missing = [name for name in TRAIN_VIEWS if not (root / name / "transforms_train.json").exists()]
     if not missing:
         announce(f"All D-NeRF scenes are already in {root}")
@@ -264,7 +261,6 @@ def _downloaded(root: Path, url: str, sha256: str | None, announce: Callable[[st
             announce(f"Downloading {url} to {archive}")
             # Images hardly compress, so unpacking takes the same space again.
             fetch(url, archive, announce=announce, space_factor=2.1)
-        _check_sum(archive, sha256)
         _install(archive, root, missing, announce)
     except FetchError as problem:
         raise SceneError(
@@ -286,15 +282,6 @@ def _downloaded(root: Path, url: str, sha256: str | None, announce: Callable[[st
 
 class _BadArchiveError(Exception):
     """The archive is damaged or not the expected one."""
-
-
-def _check_sum(archive: Path, sha256: str | None) -> None:
-    if sha256 is None:
-        return
-    with archive.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if found != sha256.lower():
-        raise _BadArchiveError(f"its SHA-256 is {found} instead of {sha256.lower()}")
 
 
 def _install(archive: Path, root: Path, names: list[str], announce: Callable[[str], None]) -> None:

@@ -7,7 +7,6 @@ import sys
 import traceback
 from collections import Counter
 from collections.abc import MutableMapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from omegaconf import DictConfig
 
 from xplanes.errors import ConfigError
 from xplanes.files import write_json, write_rows, write_text
+from xplanes.process import say
 from xplanes.tools.curves import plot_against, plot_curves
 from xplanes.tools.published import beside, check_published
 from xplanes.tools.sheet import check_what, write_sheet
@@ -31,8 +31,6 @@ from xplanes.tools.tabulate import (
     seed_table,
     shown,
 )
-
-_say = partial(print, flush=True)
 
 
 def write_tables(folder: Path, out: Path | None = None) -> str:
@@ -135,7 +133,7 @@ class SweepTable(Callback):
         if config.hydra.mode == RunMode.MULTIRUN:
             gpu = choose_gpu(config.hydra.job.num, os.environ)
             if gpu is not None:
-                _say(f"job {config.hydra.job.num} on GPU {gpu}")
+                say(f"job {config.hydra.job.num} on GPU {gpu}")
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         if config.hydra.mode != RunMode.MULTIRUN:
@@ -144,10 +142,10 @@ class SweepTable(Callback):
         # The public property raises the job's own error.
         value = job_return._return_value
         if job_return.status != JobStatus.FAILED:
-            _say(f"job {config.hydra.job.num} finished: psnr {value:.2f}  {run.name}")
+            say(f"job {config.hydra.job.num} finished: psnr {value:.2f}  {run.name}")
             return
         reason = f"{type(value).__name__}: {value}"
-        _say(f"job {config.hydra.job.num} failed: {reason}  {run.name}")
+        say(f"job {config.hydra.job.num} failed: {reason}  {run.name}")
         if not (run / "run.json").exists():
             # The job failed before it wrote run.json.
             write_json(run / "run.json", {"status": "failed", "reason": reason})
@@ -161,19 +159,19 @@ class SweepTable(Callback):
             return
         atexit.unregister(self._finish)
         try:
-            _say(f"\n{write_tables(folder)}\nwrote {folder / 'table.md'} and table.csv")
+            say(f"\n{write_tables(folder)}\nwrote {folder / 'table.md'} and table.csv")
         except ConfigError:
             return  # No job has begun.
         except Exception:
             # The runs are complete; only their table is missing.
             traceback.print_exc()
-            _say(f"no table: xplanes table {folder}")
+            say(f"no table: xplanes table {folder}")
         if self._sheet is None:
             return
         try:
-            _say(f"wrote {write_sheet(folder, folder / 'sheet.png', what=self._sheet)}")
+            say(f"wrote {write_sheet(folder, folder / 'sheet.png', what=self._sheet)}")
         except ConfigError as error:
-            _say(f"no sheet: {error}")
+            say(f"no sheet: {error}")
 
 
 def choose_gpu(job: int, environment: MutableMapping[str, str]) -> str | None:

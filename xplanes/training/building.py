@@ -12,7 +12,7 @@ from xplanes.components import build, plugins
 from xplanes.errors import ConfigError
 from xplanes.fields.base import Representation
 from xplanes.models.base import Model, ModelSettings
-from xplanes.models.initialisation import Initialisation, Method, Place
+from xplanes.models.initialisation import Initialisation, Method, Place, initialisation_of
 from xplanes.rendering.refining import RefiningSampler
 from xplanes.rendering.sampler import Sampler, Site
 from xplanes.scenes.frame import (
@@ -27,8 +27,6 @@ from xplanes.scenes.views import Scene
 
 ANOTHER_SEED = 1_000_003
 """Added to the seed when a field is re-initialised."""
-
-Initialise = Callable[[Method, Place], Initialisation]
 
 
 @dataclass(frozen=True)
@@ -99,7 +97,7 @@ def build_parts(
     hints: CubeHints | None = None,
     device: torch.device | None = None,
     devices: int = 1,
-    initialise: Initialise | None = None,
+    initialisation: Initialisation | None = None,
     frame: Frame | None = None,
     say: Callable[[str], None] = print,
 ) -> Parts:
@@ -111,7 +109,7 @@ def build_parts(
         hints: What is known of the scene's cube; the scene's points when None.
         device: Device on which the field will be trained; the CPU when None.
         devices: Number of processes that share the run.
-        initialise: Function that computes the initialisation; taken from ``lrm`` when None.
+        initialisation: The field's initialisation; computed from ``lrm`` when None.
         frame: The field's frame; chosen by the model when None.
         say: Function that receives a status line before each slow operation.
 
@@ -123,11 +121,10 @@ def build_parts(
     device = device or torch.device("cpu")
     hints = hints or CubeHints(points=scene.points)
     frame = frame or method.model.frame(views, hints)
-    if initialise is None and (source := method.lrm.load(say)) is not None:
-        initialise = source.initialise
-    found = Initialisation(method.model, frame)
-    if initialise is not None:
-        found = initialise(method, Place(scene, frame, device, devices, say, hints))
+    found = initialisation
+    if found is None:
+        place = Place(scene, frame, device, devices, say, hints)
+        found = initialisation_of(method, method.lrm.load(say), place)
     resolved = rays.on(device)
     site = Site(
         frame=found.frame,

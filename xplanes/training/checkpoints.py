@@ -181,8 +181,8 @@ def find_resumable(folder: Path) -> Path | None:
     return last
 
 
-def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
-    """Read a checkpoint, tensors and builtins only.
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """Read a checkpoint to the CPU, tensors and builtins only.
 
     Raises:
         ConfigError: If the file is missing, cannot be read, is damaged, or holds more than data.
@@ -199,7 +199,7 @@ def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
         with zipfile.ZipFile(path) as archive:
             if (name := archive.testzip()) is not None:
                 raise zipfile.BadZipFile(f"wrong checksum of {name}")
-        return torch.load(path, map_location=device, weights_only=True)
+        return torch.load(path, map_location="cpu", weights_only=True)
     except MemoryError:
         raise
     except OSError as error:

@@ -179,7 +179,7 @@ class RadianceModule(ViewScoring):
             scene: The scene, with a ``train`` split.
             frame: The field's frame; chosen by the model when None.
             **options: Further arguments of `build_parts`: ``hints``, ``device``, ``devices``,
-                ``initialise``, ``say``.
+                ``initialisation``, ``say``.
 
         Raises:
             ConfigError, SceneError, LRMError: If settings, scene and initialisation do not fit

@@ -1,10 +1,9 @@
 """The commands `xplanes pretrain-lrm` and `xplanes score-lrm`."""
 
 import argparse
-from functools import partial
 from pathlib import Path
 
-say = partial(print, flush=True)
+from xplanes.process import say
 
 
 def add_commands(commands: "argparse._SubParsersAction") -> None:

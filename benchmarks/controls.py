@@ -86,7 +86,7 @@ class ControlInitialiser(LRMInitialiser):
             method,
             place,
             cache,
-            source=f"{control} of {made.words}",
+            source=f"{control} of {made.description}",
             seconds=made.seconds,
         )
         values = found.values

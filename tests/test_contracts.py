@@ -73,7 +73,7 @@ COMPOSITIONS = [
     # The groups that go with all others, as many options of them at once as there are.
     ["data=demo", "lrm=none", "decomposition=default", "trainer=default", "preparation=default"],
     ["data=dnerf", "lrm=tiny", "decomposition=paper", "trainer=cpu"],
-    ["lrm=mini", "trainer=debug", "model/sampler=occupancy", "logger=none", "model=six_planes"],
+    ["lrm=mini", "model/sampler=occupancy", "logger=none", "model=six_planes"],
     ["data=suite", "lrm=base", "trainer=ddp", "model=nine_planes", "callbacks=default"],
     ["lrm=large", "trainer=gpu", "logger=tensorboard"],
     ["lrm=small", "model/sampler=proposal", "logger=csv"],

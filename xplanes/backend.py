@@ -78,7 +78,7 @@ def numba_found() -> bool:
     """Whether the compiled CPU loops can be used; logs once if not."""
     return _found(
         "numba",
-        "the CPU takes the plain torch path, several times slower. "
+        "PyTorch computes the same on the CPU, several times more slowly. "
         "To install it: `pip install --upgrade numba`.",
     )
 
@@ -98,7 +98,7 @@ def triton_found() -> bool:
     _settle_triton()
     return _found(
         "triton",
-        "the GPU takes the plain torch path, which is slower. "
+        "PyTorch computes the same on the GPU, more slowly. "
         "To install it: `pip install --upgrade triton` (PyTorch for CUDA on Linux includes it).",
     )
 
@@ -149,7 +149,7 @@ def proven(
     device: torch.device,
     attempt: Callable[[Callable[..., Any], torch.dtype], Sequence[Tensor]],
     kernels: Callable[..., Any],
-    plain: Callable[..., Any],
+    reference: Callable[..., Any],
     dtype: torch.dtype,
 ) -> bool:
     """Whether kernels compile, run and agree with their reference implementation; logs if not.
@@ -161,7 +161,7 @@ def proven(
         device: Device of the trial.
         attempt: Runs a function on a small input of a given type; returns values and gradients.
         kernels: The kernels on trial.
-        plain: The reference implementation.
+        reference: The reference implementation.
         dtype: Type of the planes; the reference computes in float32 at least.
 
     Raises:
@@ -171,7 +171,7 @@ def proven(
     tolerance = 1e-4 if dtype == exact else 0.05
     try:
         with torch.inference_mode(False), torch.enable_grad():
-            pairs = zip(attempt(kernels, dtype), attempt(plain, exact), strict=True)
+            pairs = zip(attempt(kernels, dtype), attempt(reference, exact), strict=True)
             for ours, theirs in pairs:
                 torch.testing.assert_close(
                     ours.to(exact), theirs, atol=tolerance, rtol=tolerance, check_dtype=False

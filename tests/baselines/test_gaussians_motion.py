@@ -183,7 +183,7 @@ def test_first_points_lie_on_what_a_field_shows(tmp_path, monkeypatch):
     assert said == ["points: training six_planes for 80 steps"]
     assert len(field) == 300
     assert found.seconds["field"] > 0
-    assert found.words == "300 points on the surfaces of six_planes, trained for 80 steps"
+    assert found.description == "300 points on the surfaces of six_planes, trained for 80 steps"
     assert torch.equal(field.centres, found.values.cloud.times)
     assert set(field.centres.tolist()) <= set(views.times.tolist())
     places = frame.to_world(field.means.detach())

@@ -13,7 +13,7 @@ from xplanes.baselines.kplanes.field import contract_cube
 from xplanes.config import CONF
 from xplanes.fields.background import FARTHEST, Background, contract, expand
 from xplanes.models.background import BackgroundSettings, weighted_median
-from xplanes.rendering.behind import behind, look
+from xplanes.rendering.behind import background_colour, behind
 from xplanes.streams import Stream, TrainingState, initial_values
 
 
@@ -92,7 +92,7 @@ def test_rays_are_composited_from_the_cube_to_infinity(samples, jittered):
     background = world(samples)
     origins, directions = some_rays(40)
     jitter = torch.linspace(0, 0.9, 40) if jittered else None
-    found = look(background, origins, directions, jitter).detach().numpy()
+    found = background_colour(background, origins, directions, jitter).detach().numpy()
     misses, within = 0, [0.5] * 40 if jitter is None else jitter.tolist()
     for origin, direction, colour, place in zip(
         origins.double().numpy(), directions.double().numpy(), found, within, strict=True
@@ -132,7 +132,7 @@ def test_rays_without_light_left_look_no_further():
     background.decoder.register_forward_hook(lambda *given: seen.append(len(given[2][0])))
     plain = torch.ones(3)
     found = behind(Before(background), origins, directions, opacity, plain)
-    whole = look(background, origins, directions)
+    whole = background_colour(background, origins, directions)
     stopped = opacity > 0.999
     assert seen == [6 * int((~stopped).sum()), 6 * 30]
     assert torch.equal(found[stopped], torch.zeros(int(stopped.sum()), 3))
@@ -158,18 +158,18 @@ def test_what_no_ray_has_crossed_keeps_the_initial_colour():
     origins, directions = some_rays(2000)
     origins, seen = 0.1 * origins, directions[:, 2] > 0
     with torch.no_grad():
-        at_first = look(background, origins, directions)
+        at_first = background_colour(background, origins, directions)
     assert (at_first - usual).abs().max() < 0.005
     planes = {"params": [background.planes], "lr": 0.2}
     decoder = {"params": background.decoder.parameters(), "lr": 0.005}
     optimizer = torch.optim.Adam([planes, decoder])
     for _ in range(40):
         optimizer.zero_grad()
-        error = look(background, origins[seen], directions[seen]) - usual
+        error = background_colour(background, origins[seen], directions[seen]) - usual
         error.square().mean().backward()
         optimizer.step()
     with torch.no_grad():
-        others = look(background, origins[~seen], directions[~seen])
+        others = background_colour(background, origins[~seen], directions[~seen])
     assert error.abs().max() < 0.05
     assert (others - usual).abs().max() < 0.05
 
@@ -177,7 +177,7 @@ def test_what_no_ray_has_crossed_keeps_the_initial_colour():
 def test_darkest_and_brightest_initial_colours_can_be_left():
     usual = torch.tensor([0.0, 1.0, 0.5])
     background = Background(3, 16, width=8, samples=0, colour=usual)
-    shown = look(background, *some_rays(4)).detach()
+    shown = background_colour(background, *some_rays(4)).detach()
     assert (shown - torch.tensor([0.02, 0.98, 0.5])).abs().max() < 0.005
 
 
@@ -211,13 +211,17 @@ def shown_elsewhere(weight):
     optimizer = torch.optim.Adam([planes, decoder])
     for step in range(160):
         optimizer.zero_grad()
-        error = (look(background, origins[seen], directions[seen]) - rays["target"]).square().mean()
+        error = (
+            (background_colour(background, origins[seen], directions[seen]) - rays["target"])
+            .square()
+            .mean()
+        )
         terms = settings.losses(background, rendering, rays, TrainingState(0, step, step, 0))
         (error + sum(terms.values())).backward()
         optimizer.step()
     assert error < 1e-3, "what is seen does not give way"
     with torch.no_grad():
-        return float(look(background, origins[other], directions[other]).mean())
+        return float(background_colour(background, origins[other], directions[other]).mean())
 
 
 def test_directions_that_no_view_shows_get_the_usual_colour():

@@ -86,7 +86,7 @@ def test_all_timesteps_are_rendered_and_steps_alone_may_limit_training(tmp_path,
     assert (asked["max_steps"], asked["max_seconds"]) == (60, None)
     assert made.views.times.tolist() == pytest.approx([step / 6 for step in range(7)])
     assert "training six_planes for 60 steps to render 7 frames" in said[0]
-    assert made.words == "7 frames rendered by six_planes trained for 60 steps"
+    assert made.description == "7 frames rendered by six_planes trained for 60 steps"
 
 
 def test_it_leaves_the_run_as_deterministic_as_it_was(tmp_path: Path, small_fields):
@@ -402,7 +402,7 @@ def test_a_video_of_the_world_around_the_thing_is_not_the_lrms(tmp_path: Path, m
 def test_masks_beside_opaque_images_cut_the_thing_out(tmp_path: Path, monkeypatch):
     bare = ball_scene(size=24)
     whole = {split: walled(views) for split, views in bare.splits.items()}
-    scene = Scene("ball", whole, cut=bare.splits["train"])
+    scene = Scene("ball", whole, lrm_views=bare.splits["train"])
     assert scene.is_surrounded
     trained = []
     fit = module.fit_quietly
@@ -412,7 +412,7 @@ def test_masks_beside_opaque_images_cut_the_thing_out(tmp_path: Path, monkeypatc
     method = settings(tmp_path, "preparation.fixed_view_steps=3")
     _, said = video_of(method, scene, tmp_path)
     ((field, shown, *_),) = trained
-    assert shown.splits["train"] is scene.cut
+    assert shown.splits["train"] is scene.lrm_views
     assert field.field.background is None
     assert not any("no silhouettes" in words for words in said)
 

@@ -156,7 +156,7 @@ def test_a_second_initialisation_comes_from_the_cache(finished, monkeypatch):
     assert all(
         torch.equal(again.values.planes[name], plane) for name, plane in first.values.planes.items()
     )
-    assert "cached" in again.words
+    assert "cached" in again.description
     with pytest.raises(AssertionError, match="computed again"):
         initialised(folder, SEQUENCE, "decomposition.tolerance=0.001")
 
@@ -182,7 +182,7 @@ def test_channels_decoder_and_frame_of_the_file_prevail(tmp_path: Path):
     )
     found, module = initialised(tmp_path, sequence, "model.precision=32")
     assert found.model.channels == 4
-    assert "4 channels (not model.channels=8)" in found.words
+    assert "4 channels (not model.channels=8)" in found.description
     assert found.frame.scale == 0.5
     points, times = torch.rand(20, 3) * 2 - 1, torch.rand(20)
     features = module.field.features(points, times)
@@ -202,7 +202,7 @@ def test_a_scene_of_one_timestep_uses_the_low_rank_part_only(tmp_path: Path):
     assert set(found.values.planes) == {"xy", "xz", "yz"}
     assert module.field.time is None
     assert (module.model.sparse, module.model.product) == (None, None)
-    assert "no time planes" in found.words
+    assert "no time planes" in found.description
     assert set(found.report) == {"xy", "xz", "yz"}
 
 

@@ -153,7 +153,7 @@ def test_the_report_is_whole(tmp_path: Path):
     assert made.report["cached"] == 0
     apart = made.report["mismatch_pixels"]
     assert 0 < apart["mean"] < apart["largest"] < 24
-    assert f"up to {apart['largest']:.1f} px apart" in made.words
+    assert f"up to {apart['largest']:.1f} px apart" in made.description
     assert made.seconds["fixed_view"] == 0
     assert made.seconds["lrm"] > lrm.seconds > 0
     assert made.picture.shape == (160, 3 * 160, 3)

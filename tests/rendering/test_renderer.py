@@ -250,8 +250,8 @@ def test_fog_before_a_background_pays_for_its_distortion():
         return sampler.losses(sampler.render(fog(level), batch, state))
 
     site = Site(cube_frame(1.0, torch.zeros(3)), torch.zeros(12), 0, "32")
-    assert terms(settings.before_colour(site)) == {}
-    found = terms(settings.before_background())["distortion"]
+    assert terms(settings.with_constant_background(site)) == {}
+    found = terms(settings.with_learnt_background())["distortion"]
     measured = renderer_of(distorted=True).render(fog(level), *rays_of(8), WHITE, batch["times"])
     assert measured.distortion is not None
     assert float(found.detach()) == pytest.approx(

@@ -12,7 +12,7 @@ from tests.oracles import project
 from xplanes.errors import ConfigError
 from xplanes.scenes.batches import NEAR_SILHOUETTE, RayBatches, RaySettings
 from xplanes.scenes.frame import Frame, cube_frame
-from xplanes.scenes.silhouettes import foreground, plain
+from xplanes.scenes.silhouettes import foreground, textureless
 from xplanes.streams import step_generator
 
 SQUARE = ball_views(5, 0.5, size=24)
@@ -199,7 +199,7 @@ def test_pixels_of_one_colour_with_all_around_them_are_plain():
     images[3, 100, 100, 0] = 240
     images[4, 100, 100, 3] = 254
     views, reach = replace(views, images=images), 4
-    found = plain(views, [reach] * 6)
+    found = textureless(views, [reach] * 6)
     assert found.any()
     for view, row, column in found.nonzero()[::37].tolist():
         around = images[view, max(0, row - reach) : row + reach + 1]
@@ -216,7 +216,7 @@ def test_plain_pixels_have_the_share_of_the_background_and_their_own_times():
     views = floor_views()
     batches = batches_of(views, per_batch=20_000, background_share=0.1, background_jitter=0.2)
     batch = batches.draw(0)
-    even = plain(views, [2] * 6)
+    even = textureless(views, [2] * 6)
     natural = float(even.float().mean())
     assert natural > 0.3
     near = foreground(views, 2) & ~even

@@ -11,7 +11,7 @@ from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.models.base import ModelSettings
 from xplanes.rendering.sampler import time_rows
-from xplanes.scenes.batches import STILL_SHARE, RayBatches
+from xplanes.scenes.batches import STATIC_SHARE, RayBatches
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.silhouettes import CHANGE, changing
 
@@ -63,7 +63,7 @@ def test_rays_see_more_of_what_changes_and_all_of_the_rest():
     drawn = RayBatches(views, frame, settings, seed=0)
     share = float(changing(views, [1] * len(views)).float().mean())
     assert 0.02 < share < 0.5
-    assert drawn.far_share == STILL_SHARE
+    assert drawn.far_share == STATIC_SHARE
     assert drawn.background_jitter == 0
     batch = drawn.draw(0)
     assert set(batch["times"].tolist()) <= set(views.times.tolist())

@@ -124,11 +124,11 @@ def test_nothing_shows_what_is_held_out_if_all_of_it_is():
     data.setup("fit")
     held_out = set(data.scene.splits["val"].files)
     places = torch.tensor([i for i, file in enumerate(train.files) if file in held_out])
-    data = SceneDataModule.of(replace(scene, video=train.subset(places), cut=train))
+    data = SceneDataModule.of(replace(scene, video=train.subset(places), lrm_views=train))
     data.setup("fit")
     assert data.scene.video is None
-    assert data.scene.cut is not None
-    assert list(data.scene.cut.files) == list(data.scene.splits["train"].files)
+    assert data.scene.lrm_views is not None
+    assert list(data.scene.lrm_views.files) == list(data.scene.splits["train"].files)
 
 
 def test_as_many_views_are_held_out_as_are_scored_at_most():

@@ -198,10 +198,10 @@ def test_masks_for_lrms_leave_the_images_whole(name: str, tmp_path: Path) -> Non
             pixels = before_noise(NAMES.index(written))
             assert np.array_equal(views.image(index)[..., :3].numpy(), pixels), written
         assert views.is_opaque
-    assert scene.cut is not None
-    assert scene.cut.files == train.files
+    assert scene.lrm_views is not None
+    assert scene.lrm_views.files == train.files
     for index, written in enumerate(TRAIN):
-        assert torch.equal(scene.cut.image(index), VIEWS.image(NAMES.index(written))), written
+        assert torch.equal(scene.lrm_views.image(index), VIEWS.image(NAMES.index(written))), written
     static = replace(FORMATS[name](tmp_path), mask_use="lrm", static=True).read().cut
     assert static is not None
     assert static.is_static

@@ -170,7 +170,7 @@ def test_fisheye_corners_have_no_rays_and_are_left_out():
     for index in (0, 1):
         images[index, ~intrinsics.has_ray(index)] = 0
     views = Views(images, surrounding(2, 3.0), torch.zeros(2), intrinsics, ("a", "b"))
-    assert views.is_cut
+    assert views.is_partial
     assert views.is_opaque
     assert torch.equal(views.valid()[0], intrinsics.has_ray(0))
     _, directions = views.image_rays(0)

@@ -25,7 +25,7 @@ from xplanes.scenes.images import final_sizes, native_sizes
 from xplanes.scenes.images import read_images as read_sized
 from xplanes.scenes.lenses import Lenses, LensModel
 from xplanes.scenes.matte import silhouette_of
-from xplanes.scenes.silhouettes import foreground, may_hold, plain
+from xplanes.scenes.silhouettes import foreground, may_hold, textureless
 from xplanes.scenes.store import RUN, PixelFile, StoredImages
 from xplanes.scenes.views import Views, joined
 from xplanes.streams import step_generator
@@ -310,10 +310,10 @@ def test_draws_from_memory_are_those_of_scattered_pixels() -> None:
             1000, 3, generator=step_generator(7, 11, 2), dtype=torch.float64
         ).numpy()
         near = foreground(views, [1] * 5).numpy().ravel()
-        even = plain(views, [1] * 5).numpy().ravel() & near & skip
+        even = textureless(views, [1] * 5).numpy().ravel() & near & skip
         far, even, rest = (np.flatnonzero(kind) for kind in (~near, even, near & ~even))
         even = even if len(even) else rest  # Whose share is 0 then.
-        ends = np.cumsum([batches.far_share, batches.plain_share])
+        ends = np.cumsum([batches.far_share, batches.textureless_share])
         pixel = np.select(
             [uniform[:, 0] < ends[0], uniform[:, 0] < ends[1]],
             [pool[(uniform[:, 1] * len(pool)).astype(int)] for pool in (far, even)],

@@ -28,7 +28,7 @@ from xplanes.fields.base import ViewDependentField
 from xplanes.fields.xplanes import random_planes
 from xplanes.optional import MissingExtraError
 from xplanes.rendering.base import RayRenderer
-from xplanes.rendering.behind import look
+from xplanes.rendering.behind import background_colour
 from xplanes.rendering.grid_renderer import GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.pictures import to_bytes
@@ -313,7 +313,7 @@ def test_the_documented_reader_sees_the_background_of_the_field(tmp_path, sample
     directions = torch.nn.functional.normalize(aims - origins, dim=1)
     found = written_reader("World")(folder / "planes.safetensors").behind(origins, directions)
     with torch.no_grad():
-        expected = look(background, *FRAME.rays(origins, directions))
+        expected = background_colour(background, *FRAME.rays(origins, directions))
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
     assert float(expected.std()) > 0.05
 

@@ -12,7 +12,7 @@ from tests.baselines.runs import KPLANES, PROPOSAL, TINEUVOX
 from tests.training.runs import small_config, train_quietly
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.baselines.proposal import spaced, unspaced
-from xplanes.rendering.behind import look
+from xplanes.rendering.behind import background_colour
 from xplanes.scenes.views import Scene
 from xplanes.training.collapse import CollapseWatch
 from xplanes.training.evaluation import affordable
@@ -165,7 +165,7 @@ def test_training_learns_what_lies_behind(trained):
     found = picture(module)
     rays = module.frame.rays(*scene("world").splits["train"].image_rays(0))
     with torch.no_grad():
-        behind = look(module.field.background, *rays).view(24, 24, 3)
+        behind = background_colour(module.field.background, *rays).view(24, 24, 3)
     clear = found["opacity"] < 1e-4
     if clear.any():
         torch.testing.assert_close(found["colour"][clear], behind[clear], atol=1e-3, rtol=0)
@@ -217,7 +217,7 @@ def test_what_is_behind_a_box_begins_where_rays_leave_it():
         field.density.bias.fill_(-60.0)  # Empty: all light passes.
         found = renderer.image(field, *rays, 0.0, torch.ones(3))
         leave = renderer.ends(*rays, field.bounds())[1]
-        expected = look(field.background, *rays, ends=lambda *_: (None, leave))
+        expected = background_colour(field.background, *rays, ends=lambda *_: (None, leave))
     assert found["opacity"].max() < 1e-6
     torch.testing.assert_close(found["colour"], expected)
     low, high = field.bounds()

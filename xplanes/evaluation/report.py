@@ -76,7 +76,7 @@ def header(
         f"{train.outline} · {size:.1f} MB{where} · {cube}",
         "model": f"{experiment.method.model.name} {module.field.outline} · "
         f"{trainable:,} parameters, {frozen:,} frozen{moving}",
-        "from": module.initialisation.words,
+        "from": module.initialisation.description,
         "samples": module.sampler.outline,
         "budget": " or ".join(limits) + ", whichever comes first" * (len(limits) > 1),
         "estimate": estimated(experiment, data, expected, spent),

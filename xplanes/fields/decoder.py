@@ -14,8 +14,13 @@ Precision = Literal["32", "bf16"]
 MOST_EXPONENT = 60.0
 """Larger logits are clamped to this: the gradients of an infinite density would be NaN."""
 
-_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"relu": torch.relu_, "silu": F.silu}
+_ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {"relu": torch.relu_, "silu": F.silu}
 
+_DENSITIES: dict[DensityActivation, Callable[[Tensor], Tensor]] = {
+    "softplus": F.softplus,
+    "exp": lambda logits: logits.clamp_max(MOST_EXPONENT).exp(),
+}
+"""To add an activation of the density, add it here and to `DensityActivation`."""
 
 ROWS = 256
 """On the CPU, matrices are padded to a multiple of this many rows; of more if they are long.
@@ -105,11 +110,7 @@ class Decoder(nn.Module):
         """Colour and density from logits, at least in float32. [N, 4] -> [N, 3], [N]"""
         if logits.dtype in (torch.float16, torch.bfloat16):
             logits = logits.float()
-        raw = logits[:, 0] - 1
-        if self.density_activation == "softplus":
-            density = F.softplus(raw)
-        else:
-            density = raw.clamp_max(MOST_EXPONENT).exp()
+        density = _DENSITIES[self.density_activation](logits[:, 0] - 1)
         colour = logits[:, 1:].sigmoid()
         if self.colour_margin:
             colour = colour * (1 + 2 * self.colour_margin) - self.colour_margin

@@ -9,7 +9,7 @@ from torch import Tensor
 from xplanes.fields.background import Background
 from xplanes.fields.regularisers import add_total_variation_gradient
 from xplanes.rendering.base import Rendering
-from xplanes.rendering.behind import look
+from xplanes.rendering.behind import background_colour
 from xplanes.rendering.sampler import Group, Site
 from xplanes.scenes.batches import Batch
 from xplanes.scenes.views import Views, spread
@@ -99,7 +99,7 @@ class BackgroundSettings(Settings):
         options = {"generator": generator, "device": usual.device}
         origins = 2 * torch.rand(UNSEEN_RAYS, 3, **options) - 1
         directions = F.normalize(torch.randn(UNSEEN_RAYS, 3, **options), dim=1)
-        error = look(background, origins, directions) - usual
+        error = background_colour(background, origins, directions) - usual
         return {"unseen": UNSEEN_EVERY * self.unseen * error.square().mean()}
 
     def regularise(self, background: Background, every: int = 1) -> None:

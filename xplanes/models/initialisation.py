@@ -43,7 +43,7 @@ class Initialisation:
             random planes, ``after`` with the initial ones.
         seconds: Seconds of each stage; for a cached stage, those of its original computation.
             ``fill``, the occupancy grid, is added once the field is built.
-        words: One-line description.
+        description: One-line description.
         pictures: Images by name, from 0 to 1: both parts at a few timesteps, and the LRM's input.
             [H, W, 3] each
         lrm: Facts about the LRM's input and frame, for metrics.json.
@@ -56,7 +56,7 @@ class Initialisation:
     values: InitialValues | None = None
     report: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=no_time)
-    words: str = "random initialisation"
+    description: str = "random initialisation"
     pictures: dict[str, Tensor] = field(default_factory=dict)
     lrm: dict[str, Any] = field(default_factory=dict)
     skipped: dict[str, float] = field(default_factory=nothing_skipped)

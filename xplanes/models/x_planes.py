@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from xplanes.decomposition.sparse_loss import SparseProduct
-from xplanes.fields.decoder import Decoder
+from xplanes.fields.decoder import Activation, Decoder, DensityActivation
 from xplanes.fields.regularisers import (
     add_distance_gradient,
     add_time_smoothness_gradient,
@@ -60,8 +60,8 @@ class DecoderSettings(Settings):
 
     width: Count  # Neurons of each hidden layer.
     hidden: Steps  # Number of hidden layers.
-    activation: Literal["relu", "silu"]  # Activation between layers.
-    density: Literal["softplus", "exp"]  # Activation of the density.
+    activation: Activation  # Activation between layers.
+    density: DensityActivation  # Activation of the density.
     density_scale: Positive  # Factor on the density.
     density_bias: float  # Initial bias of the density logit; lower values give an emptier field.
     # Initial bias of the colour logits. Above 0, colours begin near a white background. Unused if
@@ -118,7 +118,7 @@ class XPlanesLoss(Settings):
     initial_steps: Count | None
     every: Count  # Steps between evaluations of the regularisers; weights are scaled to match.
 
-    def before_background(self) -> "XPlanesLoss":
+    def with_learnt_background(self) -> "XPlanesLoss":
         """The weights for scenes in which a background is learnt."""
         weights = {
             name: self.time_factor_with_background * getattr(self, name)
@@ -244,7 +244,7 @@ class XPlanesSettings(ModelSettings):
         else:
             with torch.no_grad():
                 decoder.layers[-1].bias[0] += options.density_bias  # type: ignore[index]
-                if background is None:  # White fog before a learnt background would fade away.
+                if background is None:  # White fog in front of a learnt background would fade away.
                     decoder.layers[-1].bias[1:] += options.colour_bias  # type: ignore[index]
         decoder.requires_grad_(not options.freeze)
         return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set, background=background)
@@ -271,7 +271,7 @@ class XPlanesModel(Model):
         self.fine = None if field.fine is None else settings.fine
         self.total_variation = self.weights.total_variation
         if field.background is not None:
-            self.weights = settings.loss.before_background()
+            self.weights = settings.loss.with_learnt_background()
             self.total_variation = self.weights.total_variation_with_background
         elif self.fine is not None:
             self.total_variation = self.fine.coarse_variation

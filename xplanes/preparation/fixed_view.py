@@ -64,13 +64,13 @@ class FixedView:
         views: Frames of one camera, evenly spaced over [0, 1]; one frame for a static scene.
         target: Centre of the scene in world coordinates. [3]
         seconds: Time to produce it.
-        words: Its source, for messages.
+        description: Its source, for messages.
     """
 
     views: Views
     target: Tensor
     seconds: float
-    words: str
+    description: str
 
 
 def fixed_view(
@@ -105,8 +105,10 @@ def fixed_view(
         check_camera(scene.video)
         views = pick_frames(scene.video, torch.linspace(0, 1, count) if count > 1 else times[:1])
         return FixedView(views, frame.centre, 0.0, f"{len(views)} frames of the scene's video")
-    if scene.cut is not None:
-        place = replace(place, scene=replace(scene, splits=scene.splits | {"train": scene.cut}))
+    if scene.lrm_views is not None:
+        place = replace(
+            place, scene=replace(scene, splits=scene.splits | {"train": scene.lrm_views})
+        )
     elif scene.is_surrounded:
         place.say(
             f"fixed view: the images of {scene.name} have no silhouettes, so the LRM is shown "
@@ -262,8 +264,9 @@ def _rendered(
         Intrinsics.shared(focal, side, side, count),
         tuple(f"fixed_{number:03d}.png" for number in range(count)),
     )
-    words = f"{count} frames rendered by {options.fixed_view_model} trained for {_budget(options)}"
-    return FixedView(views, frame.centre, stage.seconds, words)
+    trained = f"{options.fixed_view_model} trained for {_budget(options)}"
+    description = f"{count} frames rendered by {trained}"
+    return FixedView(views, frame.centre, stage.seconds, description)
 
 
 def _budget(options: PreparationSettings) -> str:

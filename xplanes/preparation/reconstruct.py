@@ -54,14 +54,14 @@ class Reconstruction:
         sequence: Triplanes, decoder and frame.
         seconds: Seconds of ``fixed_view`` and ``lrm``.
         report: For metrics.json.
-        words: The source of the triplanes, for messages.
+        description: The source of the triplanes, for messages.
         picture: Contact sheet of input frames, colours in [0, 1]. [H, W, 3]
     """
 
     sequence: TriplaneSequence
     seconds: dict[str, float]
     report: dict[str, Any] = field(default_factory=dict)
-    words: str = ""
+    description: str = ""
     picture: Tensor | None = None
 
 
@@ -152,7 +152,7 @@ def reconstruct(
     decoder = model.field_decoder(half_side)
     apart = alignment.mismatch
     report = {
-        "fixed_view": video.words,
+        "fixed_view": video.description,
         "frames": len(frames),
         "distinct": encoded.distinct,
         "cached": encoded.cached,
@@ -160,9 +160,9 @@ def reconstruct(
         "half_side": half_side,
         "mismatch_pixels": {"largest": apart.largest, "mean": apart.mean},
     }
-    words = (
-        f"{options.name} ({model.config.architecture}) on {video.words}, image and field up to "
-        f"{apart.largest:.1f} px apart"
+    description = (
+        f"{options.name} ({model.config.architecture}) on {video.description}, image and field "
+        f"up to {apart.largest:.1f} px apart"
     )
     return Reconstruction(
         TriplaneSequence(
@@ -173,7 +173,7 @@ def reconstruct(
         ),
         seconds={"fixed_view": video.seconds, "lrm": lrm.seconds + encoded.seconds},
         report=report,
-        words=words,
+        description=description,
         picture=contact_sheet(frames, alignment.crop, model),
     )
 

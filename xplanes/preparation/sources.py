@@ -88,7 +88,7 @@ class LRMInitialiser(Initialiser):
         cache = cache_of(method, place)
         made = reconstruct(method, self.settings, place, self.lrm, cache)
         found = from_sequence(
-            made.sequence, method, place, cache, source=made.words, seconds=made.seconds
+            made.sequence, method, place, cache, source=made.description, seconds=made.seconds
         )
         shown = {} if made.picture is None else {"fixed_view": made.picture}
         repeated = 1 - made.report["distinct"] / made.report["frames"]
@@ -196,7 +196,7 @@ def from_sequence(
         values=InitialValues(named_planes(planes, model.plane_set), sequence.decoder, target),
         report=report | ({"unexplained": unexplained} if unexplained else {}),
         seconds=no_time() | dict(seconds) | spent,
-        words=_words(sequence, method, parts, unexplained, source),
+        description=_described(sequence, method, parts, unexplained, source),
         pictures={} if sparse is None else {"decomposition": parts_sheet(low_rank, sparse)},
         skipped=nothing_skipped() | {"directions": left_out},
     )
@@ -239,7 +239,7 @@ def _warn(report: Mapping[str, Mapping[str, Any]], method: Method) -> None:
         )
 
 
-def _words(
+def _described(
     sequence: TriplaneSequence,
     method: Method,
     parts: Stage,

@@ -25,7 +25,7 @@ def behind(
     origins: Tensor,
     directions: Tensor,
     opacity: Tensor,
-    plain: Tensor,
+    constant: Tensor,
     jitter: Tensor | None = None,
     ends: Ends = ray_box,
 ) -> Tensor:
@@ -37,7 +37,7 @@ def behind(
         directions: Unit directions. [R, 3]
         opacity: Opacity of the field along each ray. Behind opaque rays no background is computed;
             it is black. [R]
-        plain: Colour behind a field without a background. [3] or [R, 3]
+        constant: Colour behind a field without a background. [3] or [R, 3]
         jitter: Offset of each ray's samples within their steps; the middle when None. [R]
         ends: Intersects rays with the field's box.
 
@@ -46,19 +46,21 @@ def behind(
     """
     background: Background | None = getattr(field, "background", None)
     if background is None:
-        return plain
+        return constant
     clear = opacity.detach() < 1 - DARK
     if clear.device.type != "cpu":
         # Selecting the rays would wait for the device.
-        return torch.where(clear[:, None], look(background, origins, directions, jitter, ends), 0)
+        return torch.where(
+            clear[:, None], background_colour(background, origins, directions, jitter, ends), 0
+        )
     seen = clear.nonzero()[:, 0]
     place = None if jitter is None else jitter[seen]
-    colour = look(background, origins[seen], directions[seen], place, ends)
+    colour = background_colour(background, origins[seen], directions[seen], place, ends)
     black = torch.zeros_like(directions, dtype=colour.dtype)
     return black.index_put((seen,), colour)
 
 
-def look(
+def background_colour(
     background: Background,
     origins: Tensor,
     directions: Tensor,

@@ -125,15 +125,15 @@ class GridRenderer(RayRenderer):
             room=self.room,
         )
 
-        def ask(chosen: Tensor | slice) -> tuple[Tensor, Tensor]:
+        def evaluate(chosen: Tensor | slice) -> tuple[Tensor, Tensor]:
             points, ray = samples.points[chosen], samples.ray[chosen]
             return shade(field, points, times, directions, ray)
 
         if generator is None:
-            colour, density = ask(slice(None))
+            colour, density = evaluate(slice(None))
         else:
             wanted = [p for p in cast("nn.Module", field).parameters() if p.requires_grad]
-            colour, density = thinned(ask, wanted, self.thinning, generator)
+            colour, density = thinned(evaluate, wanted, self.thinning, generator)
         if samples.live is not None:
             density = torch.where(samples.live, density, 0)
         total, _ = composite(
@@ -236,9 +236,9 @@ class OccupancySettings(SamplerSettings):
             )
 
     def build(self, field: RadianceField, site: Site) -> "OccupancySampler":
-        plain = getattr(field, "background", None) is None
+        constant = getattr(field, "background", None) is None
         if self.samples == "auto":
-            least, most = FEWEST_SAMPLES, 2 * FEWEST_SAMPLES if plain else FEWEST_SAMPLES
+            least, most = FEWEST_SAMPLES, 2 * FEWEST_SAMPLES if constant else FEWEST_SAMPLES
             samples = min(max(round(SAMPLES_PER_PIXEL * site.pixels), least), most)
             return replace(self, samples=samples).build(field, site)
         along = self.samples
@@ -246,7 +246,7 @@ class OccupancySettings(SamplerSettings):
             self.grid_resolution,
             self.time_bins if site.moves else 1,
             step=DIAGONAL / along,
-            threshold=self.threshold if plain else self.threshold_with_background,
+            threshold=self.threshold if constant else self.threshold_with_background,
             decay=self.decay,
         )
         renderer = GridRenderer(
@@ -261,10 +261,12 @@ class OccupancySettings(SamplerSettings):
                 carve(grid, site.views, site.frame)
             if site.initialised and self.fill:
                 fill_seconds = _fill(renderer, field, site)
-        settings = self.before_colour(site) if plain else self.before_background()
+        settings = (
+            self.with_constant_background(site) if constant else self.with_learnt_background()
+        )
         return OccupancySampler(renderer, settings, site.samples_per_batch, fill_seconds)
 
-    def before_colour(self, site: Site) -> "OccupancySettings":
+    def with_constant_background(self, site: Site) -> "OccupancySettings":
         """Settings for a constant background: sweeps scaled to the batch size of a site.
 
         Updates of random cells are not scaled, because large batches reach more cells anyway.
@@ -276,7 +278,7 @@ class OccupancySettings(SamplerSettings):
             distortion=0.0,
         )
 
-    def before_background(self) -> "OccupancySettings":
+    def with_learnt_background(self) -> "OccupancySettings":
         """Settings for a learnt background: cells are not emptied early in training."""
         return replace(self, sweep_at=self.sweep_at[-1:], sparsity=0.0)
 

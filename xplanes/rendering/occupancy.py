@@ -111,12 +111,12 @@ class OccupancyGrid(nn.Module):
             density = torch.where(live, density, density[one])
         before, least = self.density[cells], self.least[cells]
         seen = torch.maximum(before * self.decay, density) * self.allowed[cells]
-        looked = torch.minimum(density, torch.lerp(least, density, TRUST))
+        lowest = torch.minimum(density, torch.lerp(least, density, TRUST))
         if live is not None:
             none = ~live.any()
-            seen, looked = torch.where(none, before, seen), torch.where(none, least, looked)
+            seen, lowest = torch.where(none, before, seen), torch.where(none, least, lowest)
         self.density.scatter_reduce_(0, cells, seen, "amax", include_self=False)
-        self.least.scatter_reduce_(0, cells, looked, "amin", include_self=False)
+        self.least.scatter_reduce_(0, cells, lowest, "amin", include_self=False)
         self.occupied[cells] = self.density[cells] > self.empty_density
 
     @torch.no_grad()
@@ -192,9 +192,9 @@ class OccupancyGrid(nn.Module):
         beside = self._moved(beside, (3 * uniform[: count // 2, 1:4].T).long() - 1)
         anywhere = (chosen[count // 2 :] * total).long()
         cells = torch.cat([anywhere, beside])
-        looked_at = self.allowed[cells] & (self.likely[cells] | self._beside_occupied(cells))
+        counted = self.allowed[cells] & (self.likely[cells] | self._beside_occupied(cells))
         points, times = self.draw(cells, uniform[:, 4:].float())
-        self.observe(cells, field(points, times)[1], looked_at)
+        self.observe(cells, field(points, times)[1], counted)
 
     def occupied_points(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Random points and times in occupied cells; none if all cells are empty.

@@ -13,7 +13,7 @@ from xplanes.scenes.cameras import turned
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.importance import CANDIDATES, Tiles, preferred
 from xplanes.scenes.pools import PixelPools, RunPools
-from xplanes.scenes.silhouettes import changing, foreground, plain
+from xplanes.scenes.silhouettes import changing, foreground, textureless
 from xplanes.scenes.store import RUN, StoredImages
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Settings, Share
@@ -25,10 +25,10 @@ Batch = dict[str, Any]
 NEAR_SILHOUETTE = 0.02
 """Margin around silhouettes that counts as near, as a share of the image's side."""
 
-PLAIN_SHARE = 0.2
+TEXTURELESS_SHARE = 0.2
 """Share of rays drawn at opaque pixels without texture around them."""
 
-STILL_SHARE = 0.5
+STATIC_SHARE = 0.5
 """Share of rays drawn at static pixels of fixed cameras."""
 
 PER_RUN = 32
@@ -235,9 +235,9 @@ class RayBatches(Batches):
     With ``skip_background``, pixels far from the silhouettes get ``background_share`` of the rays
     instead of their share of the pixels. They show only background, and a few rays suffice to
     prevent floaters. Space along rays with alpha 0 also counts as empty at slightly earlier and
-    later times. Opaque pixels without texture, such as those of a white floor, get `PLAIN_SHARE`.
-    In opaque images of fixed cameras, pixels that change take the role of silhouettes: the others
-    get `STILL_SHARE`, at their own times.
+    later times. Opaque pixels without texture, such as those of a white floor, get
+    `TEXTURELESS_SHARE`. In opaque images of fixed cameras, pixels that change take the role of
+    silhouettes: the others get `STATIC_SHARE`, at their own times.
 
     From images in files, each batch takes `PER_RUN` pixels from each of a few runs of consecutive
     pixels, so that it reads from few places on the disk; all pixels remain equally likely. Near and
@@ -275,25 +275,27 @@ class RayBatches(Batches):
             self.tiles = Tiles.of(views) if self.error_share else None
             if settings.skip_background and views.is_opaque:
                 changes = changing(views, margins)  # Large captures are sampled uniformly.
-            skips_plain = settings.skip_background and changes is None
+            skips_textureless = settings.skip_background and changes is None
             self.pools = PixelPools(
                 foreground(views, margins) if changes is None else changes,
-                plain(views, margins) if skips_plain else None,
-                views.valid() if views.is_cut else None,
+                textureless(views, margins) if skips_textureless else None,
+                views.valid() if views.is_partial else None,
             )
-        self.far_pixels, plain_pixels, others = self.pools.sizes
+        self.far_pixels, textureless_pixels, others = self.pools.sizes
         self._prefetched = -1
-        self.near_pixels = plain_pixels + others
+        self.near_pixels = textureless_pixels + others
         pixels = self.near_pixels + self.far_pixels
-        natural, plain_natural = self.far_pixels / pixels, plain_pixels / pixels
+        natural, textureless_natural = self.far_pixels / pixels, textureless_pixels / pixels
         skip = settings.skip_background and self.near_pixels > 0
-        share = settings.background_share if changes is None else STILL_SHARE
+        share = settings.background_share if changes is None else STATIC_SHARE
         self.far_share = min(share, natural) if skip else natural
-        self.plain_share = min(PLAIN_SHARE, plain_natural) if skip else plain_natural
+        self.textureless_share = (
+            min(TEXTURELESS_SHARE, textureless_natural) if skip else textureless_natural
+        )
         jitter = skip and natural > 0 and not views.is_static and changes is None
         self.background_jitter = settings.background_jitter if jitter else 0.0
-        self.skipped = natural + plain_natural - self.far_share - self.plain_share
-        self.pools.share(self.far_share, self.plain_share)
+        self.skipped = natural + textureless_natural - self.far_share - self.textureless_share
+        self.pools.share(self.far_share, self.textureless_share)
 
     def add_slopes(self) -> None:
         if isinstance(self.views.images, StoredImages):

@@ -217,8 +217,9 @@ class SceneDataModule(LightningDataModule):
             "val": train.subset(chosen.nonzero()[:, 0]),
         }
         shared = set(parts["val"].files)
-        video, cut = (_without(views, shared) for views in (self.scene.video, self.scene.cut))
-        self._scene = replace(self.scene, splits=self.scene.splits | parts, video=video, cut=cut)
+        rest = {name: getattr(self.scene, name) for name in ("video", "lrm_views")}
+        rest = {name: _without(views, shared) for name, views in rest.items()}
+        self._scene = replace(self.scene, splits=self.scene.splits | parts, **rest)
         self._batches = {}  # Earlier batches included the held-out views.
         self.held_out = len(parts["val"])
 

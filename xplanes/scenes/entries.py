@@ -39,7 +39,7 @@ RIGID_TOLERANCE = 1e-3
 FARTHEST = 1e15
 """Largest coordinate of a camera; its square still fits single precision."""
 
-STILL = 1e-4
+SAME_PLACE = 1e-4
 """Largest difference, in world units, between positions of a fixed camera."""
 
 FAR_OFF = 60
@@ -75,8 +75,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         if (parent := _like(image.parent)) is None:
             continue
         wanted = image.stem if image.suffix.lower() in ENDINGS else image.name
-        found = _stems(parent).get(_plain(wanted), ())
-        same = [path for path in found if _plain(path.name) == _plain(image.name)]
+        found = _stems(parent).get(_normalised(wanted), ())
+        same = [path for path in found if _normalised(path.name) == _normalised(image.name)]
         if len(chosen := same or found) == 1:
             return _with_content(label, chosen[0])
     if Path(name).is_absolute() and Path(name).is_file():
@@ -139,11 +139,11 @@ def _stems_at(folder: Path, changed: int) -> dict[str, list[Path]]:
     if len(inside) == 1 and inside[0].is_dir():  # The archive was unpacked one level too deep.
         inside = sorted(inside[0].iterdir())
     for path in filter(Path.is_file, filter(is_image, inside)):
-        found.setdefault(_plain(path.stem), []).append(path)
+        found.setdefault(_normalised(path.stem), []).append(path)
     return found
 
 
-def _plain(name: str) -> str:
+def _normalised(name: str) -> str:
     """A name in lower case and normalised; macOS stores accents as separate characters."""
     return unicodedata.normalize("NFC", name).casefold()
 
@@ -154,7 +154,9 @@ def _like(folder: Path) -> Path | None:
         return folder
     if (parent := _like(folder.parent)) is None:
         return None
-    names = [path for path in parent.iterdir() if _plain(path.name) == _plain(folder.name)]
+    names = [
+        path for path in parent.iterdir() if _normalised(path.name) == _normalised(folder.name)
+    ]
     return names[0] if len(names) == 1 and names[0].is_dir() else None
 
 
@@ -224,7 +226,7 @@ def _mask(root: Path, names: Sequence[str]) -> Path | None:
     """The mask that has one of the names; PNG takes precedence over other endings."""
     for name in names:
         if (parent := _like((root / name).parent)) is not None:
-            found = _stems(parent).get(_plain(PurePosixPath(name).name), [])
+            found = _stems(parent).get(_normalised(PurePosixPath(name).name), [])
             if len(chosen := [path for path in found if path.suffix == ".png"] or found) == 1:
                 return chosen[0]
     return None
@@ -406,7 +408,7 @@ def require_precision(source: Path, positions: np.ndarray) -> None:
     """
     extent = float(np.ptp(positions, axis=0).max())
     largest = float(np.abs(positions).max())
-    fixed = extent <= STILL
+    fixed = extent <= SAME_PLACE
     room = FARTHEST if fixed else ROUNDING * extent / float(np.finfo(np.float32).eps)
     if not largest <= min(room, FARTHEST):
         raise SceneError(

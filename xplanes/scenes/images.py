@@ -22,8 +22,8 @@ from xplanes.scenes.store import Size
 
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "P", "PA", "1")
 
-PLAIN = MaskKind(labels=False)
-"""Kind of plain masks, from black to white."""
+GREY = MaskKind(labels=False)
+"""Kind of grey masks, from black to white."""
 
 MASKS = 3
 """Version of the treatment of masks; increase it whenever decoded images change."""
@@ -94,7 +94,7 @@ def read_images(
     masks: Sequence[Path | None] = (),
     has_ray: Sequence[Tensor | None] = (),
     cache: Path | None = None,
-    kind: MaskKind = PLAIN,
+    kind: MaskKind = GREY,
     clear: Sequence[int] = (),
 ) -> Tensor | store.StoredImages:
     """Decode images of any sizes and reduce them.
@@ -140,7 +140,7 @@ def _jobs(
     sizes: Sequence[Size],
     masks: Sequence[Path | None] = (),
     has_ray: Sequence[Tensor | None] = (),
-    kind: MaskKind = PLAIN,
+    kind: MaskKind = GREY,
     clear: Sequence[int] = (),
 ) -> list[store.Job]:
     """Jobs that decode the images, one for each."""
@@ -176,7 +176,7 @@ def read_image(
     path: Path,
     size: Size,
     mask: Path | None = None,
-    kind: MaskKind = PLAIN,
+    kind: MaskKind = GREY,
     clear: Sequence[int] = (),
 ) -> np.ndarray:
     """Decode one image, multiply it by its mask, and reduce it. uint8 [H, W, 4]"""

@@ -13,7 +13,7 @@ from torch import Tensor
 from xplanes.errors import MissingSplitError, SceneError, refuse_all, warn
 from xplanes.scenes.entries import refuse_repeats, require_precision, some
 from xplanes.scenes.formats import UNTURN, mask_misfit, orientation
-from xplanes.scenes.images import PLAIN, Size, final_sizes, native_sizes, read_images
+from xplanes.scenes.images import GREY, Size, final_sizes, native_sizes, read_images
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.masks import MaskKind, MaskUse, chosen_use, ignored_pixels, survey
 from xplanes.scenes.views import Intrinsics, Views, spread
@@ -86,7 +86,7 @@ class Calibration:
         return (focal_x, focal_y), (centre_x, centre_y), self.skew / wide * width
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """Description of the lens, for messages."""
         named = [
             f"{'omega' if self.model == LensModel.FOV else name}={value:g}"
@@ -275,7 +275,7 @@ def read_views(
             lens maps no direction to a pixel.
     """
     if kind is None:
-        kind = survey(listing.masks) if any(listing.masks) else PLAIN
+        kind = survey(listing.masks) if any(listing.masks) else GREY
     ignored = None
     native = native_sizes(listing.paths)
     sizes = final_sizes(listing.paths, native, resolution)
@@ -343,7 +343,7 @@ def read_splits(
             splits; those of ``parts`` when None.
 
     Returns:
-        The views of each split, `Scene.cut` and `Scene.notes`.
+        The views of each split, `Scene.lrm_views` and `Scene.notes`.
 
     Raises:
         SceneError: As `read_views`; or with mask_use lrm if there are no masks.
@@ -361,16 +361,16 @@ def read_splits(
     told = next((listing.mask_meaning for listing in listings if listing.mask_meaning), "")
     kind = survey(masks, told == "ignored")
     use, notes["masks"] = chosen_use(mask_use, kind, str(listings[0].paths[0].parent), told)
-    cut = None
+    lrm_views = None
     if use == "lrm":
         if "train" in parts:
-            cut = read_views(parts["train"], resolution, cache, kind=kind)
+            lrm_views = read_views(parts["train"], resolution, cache, kind=kind)
         parts = {split: replace(part, masks=()) for split, part in parts.items()}
     read = {
         split: read_views(part, resolution, cache, use == "ignore", kind)
         for split, part in parts.items()
     }
-    return read, cut, notes
+    return read, lrm_views, notes
 
 
 def _require_shapes(listing: Listing) -> None:
@@ -481,8 +481,8 @@ def _require_real(
         )
     if any(not abs(value) <= STRONGEST for value in camera.distortion):
         raise SceneError(
-            f"{label}: its {camera.words}; no coefficient may exceed {STRONGEST:g}. Correct the "
-            "camera, or calibrate again."
+            f"{label}: its {camera.description}; no coefficient may exceed {STRONGEST:g}. Correct "
+            "the camera, or calibrate again."
         )
 
 
@@ -507,7 +507,9 @@ def require_rays(
         if shown is None:
             continue
         share = float((~shown).float().mean())
-        fault = f"{label}: its {lens.words} folds back inside the image: no direction belongs to "
+        fault = (
+            f"{label}: its {lens.description} folds back inside the image: no direction belongs to "
+        )
         if lens.model != LensModel.PERSPECTIVE and share < 1:
             continue
         if share <= MOST_FOLDED:

@@ -13,10 +13,10 @@ from xplanes.scenes.silhouettes import count_in_squares
 from xplanes.scenes.store import RUN, StoredImages
 from xplanes.scenes.views import Views
 
-FAR, OTHER, PLAIN, NOTHING = range(4)
+FAR, OTHER, TEXTURELESS, NOTHING = range(4)
 """Kinds of pixels, as numbers."""
 
-ORDER = (FAR, PLAIN, OTHER)
+ORDER = (FAR, TEXTURELESS, OTHER)
 """Order of the kinds in the list."""
 
 BLOCK = 2**16
@@ -30,26 +30,27 @@ CELLS = 8
 
 
 class PixelPools:
-    """Pixels of three kinds, drawn with separate shares: far, plain and all others.
+    """Pixels of three kinds, drawn with separate shares: far, textureless and all others.
 
     Pixels are listed by kind, with the lower 16 bits of their indices: full indices would take as
     much memory as the images.
 
     Args:
         near: Pixels near silhouettes; all others are far. Overwritten. bool [V, H, W]
-        plain: Pixels without texture around them; None for none. bool [V, H, W]
+        textureless: Pixels without texture around them; None for none. bool [V, H, W]
         valid: Pixels that may be drawn; None for all. bool [V, H, W]
 
     Attributes:
-        sizes: Numbers of far, plain and other pixels; if there were no others, none are plain.
+        sizes: Numbers of far, textureless and other pixels; if there were no others, none are
+            textureless.
     """
 
     def __init__(
-        self, near: Tensor, plain: Tensor | None = None, valid: Tensor | None = None
+        self, near: Tensor, textureless: Tensor | None = None, valid: Tensor | None = None
     ) -> None:
         kinds = near.view(torch.uint8)
-        if plain is not None and (near & ~plain).any():
-            kinds.add_(near & plain)
+        if textureless is not None and (near & ~textureless).any():
+            kinds.add_(near & textureless)
         if valid is not None:
             kinds.masked_fill_(~valid, NOTHING)
         blocks = kinds.flatten().split(BLOCK)
@@ -72,9 +73,9 @@ class PixelPools:
             for kind, part in itertools.product(ORDER, blocks):
                 next(places).copy_((part == kind).nonzero()[:, 0])
 
-    def share(self, far: float, plain: float) -> None:
-        """Set the shares of far and of plain pixels."""
-        self.bounds = torch.tensor([far, plain], dtype=torch.float64).cumsum(dim=0)
+    def share(self, far: float, textureless: float) -> None:
+        """Set the shares of far and of textureless pixels."""
+        self.bounds = torch.tensor([far, textureless], dtype=torch.float64).cumsum(dim=0)
 
     def to(self, device: torch.device) -> "PixelPools":
         """The pools on another device."""
@@ -120,7 +121,7 @@ class RunPools:
         margins: Pixels around the silhouette of each image that are near, too. [V]
 
     Attributes:
-        sizes: Numbers of far, plain and near pixels; none are plain.
+        sizes: Numbers of far, textureless and near pixels; none are textureless.
     """
 
     def __init__(self, views: Views, images: StoredImages, margins: Sequence[int]) -> None:
@@ -155,8 +156,8 @@ class RunPools:
         """Number of pixels per run; the last run of an image may have fewer. [K]"""
         return (self.pixels[view] - RUN * run).clamp(max=RUN)
 
-    def share(self, far: float, plain: float) -> None:
-        """Set the share of far pixels; none are plain."""
+    def share(self, far: float, textureless: float) -> None:
+        """Set the share of far pixels; none are textureless."""
         self.far_share = far
 
     def pick(self, kind: Tensor, where: Tensor) -> tuple[Tensor, Tensor, Tensor]:

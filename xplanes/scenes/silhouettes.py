@@ -41,7 +41,7 @@ def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
     return near
 
 
-def plain(views: Views, margins: Sequence[int]) -> Tensor:
+def textureless(views: Views, margins: Sequence[int]) -> Tensor:
     """Opaque pixels in a neighbourhood of one colour: walls and floors without texture.
 
     Args:

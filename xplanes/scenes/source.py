@@ -57,10 +57,10 @@ def as_static(scene: Scene, reason: str) -> Scene:
     if video is not None:
         video = video.subset(torch.zeros(1, dtype=torch.long))
         video = replace(video, times=torch.zeros(1))
-    cut = scene.cut
-    if cut is not None:
-        cut = replace(cut, times=torch.zeros_like(cut.times))
-    return replace(scene, splits=splits, video=video, cut=cut, static_reason=reason)
+    lrm_views = scene.lrm_views
+    if lrm_views is not None:
+        lrm_views = replace(lrm_views, times=torch.zeros_like(lrm_views.times))
+    return replace(scene, splits=splits, video=video, lrm_views=lrm_views, static_reason=reason)
 
 
 def warn_of_masks(folder: Path, images: Sequence[Path]) -> None:
@@ -217,14 +217,14 @@ class SceneSettings(Settings, ABC):
             SceneError: If an image or a mask cannot be used.
         """
         read = read_splits(parts, self.resolution, self.image_cache, mask_use, whole)
-        splits, cut, notes = read
+        splits, lrm_views, notes = read
         if not up:
             poses = torch.cat([listing.camera_to_world for listing in parts.values()])
             up = world_turn(poses, (), False)[1]
             if world_turn(poses, (), None)[0] is not None:
                 warn(f"{self.folder}: up is {up}. If the scene lies on its side, rotate the poses.")
         notes = {**notes, "up": up}
-        return Scene(self.folder.resolve().name, splits, cut=cut, notes=notes, **more)
+        return Scene(self.folder.resolve().name, splits, lrm_views=lrm_views, notes=notes, **more)
 
     def read(self, splits: Sequence[str] | None = None) -> Scene:
         """Read the scene as these settings specify.

@@ -291,7 +291,7 @@ def _has_content(value: Any) -> bool:
     return any(map(_has_content, value)) if isinstance(value, list) else bool(value)
 
 
-def _plain(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
+def _standard(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
     """The keys in standard form: strings as numbers, and alternative intrinsics by standard keys.
 
     Fields of view are converted to radians. instant-ngp's x_fov, which takes precedence over focal
@@ -355,7 +355,7 @@ def read_frames(path: Path) -> dict[str, Any]:
                 "OpenGL's (x right, y up, z backward). Convert transform_matrix, and remove the "
                 "key."
             )
-    return _plain(path, content) | {"frames": [_plain(path, each) for each in frames]}
+    return _standard(path, content) | {"frames": [_standard(path, each) for each in frames]}
 
 
 def _key(entries: Sequence[Mapping[str, Any]]) -> str:

@@ -234,7 +234,7 @@ class Views:
         return int(self.intrinsics.size.prod(dim=1).sum())
 
     @property
-    def is_cut(self) -> bool:
+    def is_partial(self) -> bool:
         """Whether some pixels are left out: padding, pixels without a ray, and ignored ones."""
         sights = self.intrinsics.sights or []
         return (
@@ -486,8 +486,8 @@ class Scene:
         static_reason: Why the scene is known to be static; empty if it may be dynamic.
         points: Surface points in the world, such as from structure from motion; None if unknown.
             float32 [N, 3]
-        cut: Training views masked to the foreground object, for LRMs, if ``splits`` show whole
-            images; None if the alpha of ``splits`` contains the masks, or there are no masks.
+        lrm_views: Training views masked to the foreground object, for LRMs alone; None if there are
+            no masks, or the alpha of ``splits`` contains them.
         refine_cameras: Whether training corrects the poses of its cameras.
         notes: Observations made while reading the scene: sentences by subject.
     """
@@ -498,7 +498,7 @@ class Scene:
     background: Tensor = field(default_factory=lambda: torch.ones(3))
     static_reason: str = ""
     points: Tensor | None = None
-    cut: Views | None = None
+    lrm_views: Views | None = None
     refine_cameras: bool = False
     notes: Mapping[str, str] = field(default_factory=dict)
 

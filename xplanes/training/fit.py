@@ -17,7 +17,7 @@ from lightning.pytorch.plugins.io import CheckpointIO
 from xplanes.backend import cpu_loops, synchronize
 from xplanes.errors import ConfigError
 from xplanes.rendering.base import RayRenderer
-from xplanes.rendering.behind import look
+from xplanes.rendering.behind import background_colour
 from xplanes.rendering.warming import warming_up
 from xplanes.scenes.batches import Batch
 from xplanes.scenes.datamodule import SceneDataModule
@@ -324,7 +324,8 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         later = _seconds(lambda: renderer.image(solid, origins, directions, *seen_at), device)
         if (background := getattr(field, "background", None)) is not None:
             with torch.no_grad():
-                later += BEHIND * _seconds(lambda: look(background, origins, directions), device)
+                rays = origins, directions
+                later += BEHIND * _seconds(lambda: background_colour(background, *rays), device)
     return Estimate(taken, first / len(chosen), later / len(chosen), pruned_at)
 
 

@@ -235,15 +235,15 @@ def test_masks_of_a_thing_cut_it_out_where_that_is_asked_for(tmp_path):
 
     whole, alpha, lrm = (scene("phone", use) for use in ("score", "alpha", "lrm"))
     masks = whole.splits["train"].foreground
-    assert whole.cut is None
-    assert alpha.cut is None
+    assert whole.lrm_views is None
+    assert alpha.lrm_views is None
     assert torch.equal(alpha.splits["train"].images[..., 3], masks)
     assert alpha.splits["test"].is_opaque
-    assert torch.equal(lrm.cut.images, alpha.splits["train"].images)
+    assert torch.equal(lrm.lrm_views.images, alpha.splits["train"].images)
     assert torch.equal(lrm.splits["train"].images, whole.splits["train"].images)
     shown = masks == 255
-    assert torch.equal(lrm.cut.images[shown], whole.splits["train"].images[shown])
-    assert not lrm.cut.images[masks == 0].any()
+    assert torch.equal(lrm.lrm_views.images[shown], whole.splits["train"].images[shown])
+    assert not lrm.lrm_views.images[masks == 0].any()
     words = "data.mask_use=alpha: dark has no surroundings.*score"
     assert_refused(SceneError, words, lambda: scene("dark", "alpha"), "dark")
 

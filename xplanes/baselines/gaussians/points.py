@@ -101,7 +101,7 @@ class FieldInitialiser(Initialiser):
             frame_content(place.frame),
             field.plain(),
             self.key,
-            [None if more is None else more.identity for more in (scene.cut, scene.video)],
+            [None if more is None else more.identity for more in (scene.lrm_views, scene.video)],
             [settings.steps, settings.seconds, count],
         ]
 
@@ -139,7 +139,7 @@ class FieldInitialiser(Initialiser):
             frame=place.frame,
             values=InitialPoints(cloud=cloud),
             seconds=no_time() | {"field": stage.seconds},
-            words=f"{len(cloud.points):,} points on the surfaces of {settings.model}, "
+            description=f"{len(cloud.points):,} points on the surfaces of {settings.model}, "
             f"trained for {self._budget}",
         )
 

@@ -371,10 +371,10 @@ class SuiteSettings(ProceduralSettings):
                 f"data.mask_use={self.mask_use}: {self.scene} has no surroundings, so it has no "
                 "masks. Set it to score."
             )
-        cut = cut_out(train, train.foreground)
+        lrm_views = cut_out(train, train.foreground)
         if self.mask_use == "lrm":
-            return replace(scene, cut=cut)
-        return replace(scene, splits=scene.splits | {"train": cut})
+            return replace(scene, lrm_views=lrm_views)
+        return replace(scene, splits=scene.splits | {"train": lrm_views})
 
 
 def cut_out(views: Views, foreground: Tensor) -> Views:

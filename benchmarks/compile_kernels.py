@@ -34,7 +34,7 @@ from xplanes.baselines.products import DYNAMIC, plane_product_gpu
 from xplanes.fields.lookup import plane_features_gpu
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.rendering.compositing import composite_gpu
-from xplanes.rendering.marching import march_gpu
+from xplanes.rendering.marching import Rays, march_gpu
 from xplanes.rendering.occupancy import OccupancyGrid
 
 ARCHITECTURES = (80, 86, 90, 120)
@@ -141,7 +141,7 @@ def marching() -> None:
     grid, rays = OccupancyGrid(4, 2, step=0.1), [torch.zeros(5, 3), torch.ones(5, 3)]
     rays += [torch.zeros(5), torch.zeros(5)]
     given = {"step": 0.1, "occupied": grid.occupied, "limit": 7.0}
-    march_gpu(*rays, grid, room=9, **given)
+    march_gpu(Rays(*rays), grid, room=9, **given)
 
 
 CASES: dict[str, Callable[[], None]] = {

@@ -42,7 +42,9 @@ def marched():
     grid = test_march.grid_of().to(DEVICE)
     rays = there(test_march.rays_of(5, torch.float32))
     expected = test_march.twin(rays, grid, occlusion=0.001)
-    found = marching.march(*rays, grid, step=test_march.STEP, occlusion=0.001, room=90)
+    found = marching.march(
+        marching.Rays(*rays), grid, step=test_march.STEP, occlusion=0.001, room=90
+    )
     return [
         [samples.cells[: len(expected)], samples.distances[: len(expected)]]
         for samples in (found, expected)

@@ -71,9 +71,9 @@ def test_few_rays_find_the_cells_that_rays_through_all_pixels_find(monkeypatch, 
     views = ball_views(8, 0.5, size=160)
     rays = []
 
-    def counted(origins, *rest, **named):
-        rays.append(len(origins))
-        return march(origins, *rest, **named)
+    def counted(given, *rest, **named):
+        rays.append(len(given.origins))
+        return march(given, *rest, **named)
 
     monkeypatch.setattr(filling, "march", counted)
     few = filled(views, ball_field(shown, static), resolution=12)

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from tests.oracles import march as oracle
 from tests.oracles import ray_box
-from xplanes.rendering.marching import march, march_gpu, march_into, march_reference
+from xplanes.rendering.marching import Rays, march, march_gpu, march_into, march_reference
 from xplanes.rendering.occupancy import OccupancyGrid
 
 try:
@@ -58,14 +58,14 @@ def rays_of(count, dtype=torch.float64, seed=1):
 def twin(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0, **options):
     limit = -math.log(occlusion) if occlusion > 0 else math.inf
     occupied = grid.occupied if skip_empty else None
-    return march_reference(*rays, grid, step=step, occupied=occupied, limit=limit, **options)
+    return march_reference(Rays(*rays), grid, step=step, occupied=occupied, limit=limit, **options)
 
 
 def into(rays, grid, room, *, step=STEP, skip_empty=True, occlusion=0.0, **options):
     limit = -math.log(occlusion) if occlusion > 0 else math.inf
     occupied = grid.occupied if skip_empty else None
     given = {"step": step, "occupied": occupied, "limit": limit, **options}
-    return march_into(*rays, grid, room=room, **given)
+    return march_into(Rays(*rays), grid, room=room, **given)
 
 
 def by_kernel(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0, room=None, **options):
@@ -76,7 +76,7 @@ def by_kernel(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0, room=Non
     occupied = grid.occupied if skip_empty else None
     options = {name: part.to(device) for name, part in options.items()}
     given = {"step": step, "occupied": occupied, "limit": limit, "room": room}
-    found = march_gpu(*rays, grid, **given, **options)
+    found = march_gpu(Rays(*rays), grid, **given, **options)
     on_cpu = {n: t.cpu() for n, t in vars(found).items() if isinstance(t, torch.Tensor)}
     return dataclasses.replace(found, **on_cpu)
 
@@ -102,7 +102,7 @@ def test_samples_equal_the_loops_of_the_oracle():
         grid, rays = grid_of(), rays_of(60)
         kept, counts = by_oracle(rays, grid, skip_empty=skip, occlusion=occlusion)
         for found in (
-            march(*rays, grid, step=STEP, skip_empty=skip, occlusion=occlusion),
+            march(Rays(*rays), grid, step=STEP, skip_empty=skip, occlusion=occlusion),
             twin(rays, grid, skip_empty=skip, occlusion=occlusion),
         ):
             assert found.ray.tolist() == [row[0] for row in kept], case
@@ -122,7 +122,7 @@ def test_samples_equal_the_loops_of_the_oracle():
 
 def test_in_float32_only_samples_on_borders_differ():
     grid, rays = grid_of(17, 5, filled=1.1), rays_of(3000, torch.float32)
-    ours, theirs = march(*rays, grid, step=STEP), twin(rays, grid)
+    ours, theirs = march(Rays(*rays), grid, step=STEP), twin(rays, grid)
     for found in (ours, theirs):
         assert found.candidates == found.empty + found.occluded + len(found)
         assert (found.ray.diff() >= 0).all()
@@ -159,7 +159,7 @@ def test_rays_that_miss_have_no_samples_and_do_not_shift_the_others():
     grid, rays = grid_of(filled=1.1), list(rays_of(9))
     rays[0][::3] = torch.tensor([0.0, 0, 5]).double()
     rays[1][::3] = torch.tensor([0.0, 0, 1]).double()
-    for found in (march(*rays, grid, step=STEP), twin(rays, grid)):
+    for found in (march(Rays(*rays), grid, step=STEP), twin(rays, grid)):
         assert not set(found.ray.tolist()) & {0, 3, 6}
         ends = [*found.starts.tolist()[1:], len(found)]
         for ray, (start, end) in enumerate(zip(found.starts.tolist(), ends, strict=True)):
@@ -171,7 +171,7 @@ def test_impossible_rays_have_no_samples():
     for bad in [math.nan, math.inf, -math.inf]:
         grid, rays = grid_of(filled=1.1), list(rays_of(4))
         rays[0][1, 2], rays[1][2, 0] = bad, bad
-        for found in (march(*rays, grid, step=STEP), twin(rays, grid)):
+        for found in (march(Rays(*rays), grid, step=STEP), twin(rays, grid)):
             assert set(found.ray.tolist()) <= {0, 3}, bad
             assert found.points.isfinite().all(), bad
 
@@ -180,7 +180,7 @@ def test_no_rays_or_no_hits():
     missing = rays_of(3)[0] + 9, *rays_of(3)[1:]
     for rays in (rays_of(0), missing):
         case = f"{len(rays[0])} rays"
-        for found in (march(*rays, grid_of(), step=STEP), twin(rays, grid_of())):
+        for found in (march(Rays(*rays), grid_of(), step=STEP), twin(rays, grid_of())):
             assert len(found) == found.candidates == found.empty == found.occluded == 0, case
             assert found.points.shape == (0, 3), case
             assert found.starts.tolist() == [0] * len(rays[0]), case
@@ -190,7 +190,7 @@ def test_huge_densities_on_one_ray_do_not_disturb_the_next():
     for huge in [1e8, 1e20, 1e30, 3e38, math.inf]:
         grid, rays = grid_of(8, 1, filled=1.1, dense=3.0), rays_of(400)
         grid.least[::7] = huge
-        ours = march(*rays, grid, step=STEP, occlusion=0.2)
+        ours = march(Rays(*rays), grid, step=STEP, occlusion=0.2)
         theirs = twin(rays, grid, occlusion=0.2)
         assert torch.equal(ours.ray, theirs.ray), huge
         assert torch.equal(ours.cells, theirs.cells), huge
@@ -212,7 +212,7 @@ def test_any_grid_and_step(resolution, bins, step, occlusion, skip, seed):
     grid, rays = grid_of(resolution, bins, seed=seed), rays_of(12, seed=seed)
     kept, counts = by_oracle(rays, grid, step=step, skip_empty=skip, occlusion=occlusion)
     for found in (
-        march(*rays, grid, step=step, skip_empty=skip, occlusion=occlusion),
+        march(Rays(*rays), grid, step=step, skip_empty=skip, occlusion=occlusion),
         twin(rays, grid, step=step, skip_empty=skip, occlusion=occlusion),
     ):
         assert found.cells.tolist() == [row[2] for row in kept]

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from xplanes.rendering.marching import march
+from xplanes.rendering.marching import Rays, march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.streams import counted_uniform
 
@@ -169,7 +169,7 @@ def test_what_is_there_only_at_times_hides_nothing():
     ray = [torch.tensor([v]) for v in ([-2.0, 0.1, 0.1], [1.0, 0.0, 0.0])]
     rest = torch.zeros(1), torch.full((1,), 0.5)
     whole, behind = (
-        march(*ray, *rest, grid, step=STEP, occlusion=1e-5) for grid in (passing, solid)
+        march(Rays(*ray, *rest), grid, step=STEP, occlusion=1e-5) for grid in (passing, solid)
     )
     assert passing.occupied.all()
     assert (passing.density > 20).all()

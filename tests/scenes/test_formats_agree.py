@@ -202,7 +202,7 @@ def test_masks_for_lrms_leave_the_images_whole(name: str, tmp_path: Path) -> Non
     assert scene.lrm_views.files == train.files
     for index, written in enumerate(TRAIN):
         assert torch.equal(scene.lrm_views.image(index), VIEWS.image(NAMES.index(written))), written
-    static = replace(FORMATS[name](tmp_path), mask_use="lrm", static=True).read().cut
+    static = replace(FORMATS[name](tmp_path), mask_use="lrm", static=True).read().lrm_views
     assert static is not None
     assert static.is_static
 

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from xplanes.rendering.box import Field
-from xplanes.rendering.marching import Samples, march
+from xplanes.rendering.marching import Rays, Samples, march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
@@ -121,4 +121,5 @@ def _samples(
     grid: OccupancyGrid, origins: Tensor, directions: Tensor, time: Tensor, step: float
 ) -> Samples:
     times = time.expand(len(origins))
-    return march(origins, directions, times, torch.full_like(times, 0.5), grid, step=step)
+    rays = Rays(origins, directions, times, torch.full_like(times, 0.5))
+    return march(rays, grid, step=step)

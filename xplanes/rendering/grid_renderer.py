@@ -18,7 +18,7 @@ from xplanes.rendering.carving import carve
 from xplanes.rendering.compositing import composite, distortion
 from xplanes.rendering.filling import fill
 from xplanes.rendering.front_to_back import front_to_back
-from xplanes.rendering.marching import march
+from xplanes.rendering.marching import Rays, march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
 from xplanes.rendering.thinning import thinned
@@ -113,11 +113,9 @@ class GridRenderer(RayRenderer):
         Returns:
             One value per ray.
         """
+        offset = torch.full_like(times, 0.5) if jitter is None else jitter
         samples = march(
-            origins,
-            directions,
-            times,
-            torch.full_like(times, 0.5) if jitter is None else jitter,
+            Rays(origins, directions, times, offset),
             self.grid,
             step=self.step,
             skip_empty=self.skip_empty,
@@ -163,15 +161,8 @@ class GridRenderer(RayRenderer):
         """As `render`, without gradients; on the CPU with early ray termination."""
         if not cpu_loops(origins):
             return super().pixels(field, origins, directions, times, background)
-        samples = march(
-            origins,
-            directions,
-            times,
-            torch.full_like(times, 0.5),
-            self.grid,
-            step=self.step,
-            skip_empty=self.skip_empty,
-        )
+        rays = Rays(origins, directions, times, torch.full_like(times, 0.5))
+        samples = march(rays, self.grid, step=self.step, skip_empty=self.skip_empty)
         total = front_to_back(
             field, samples, times, directions, step=self.step, occlusion=self.occlusion
         )

@@ -4,6 +4,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,6 +20,22 @@ OUTSIDE = 3.0
 
 STEP_OF_TRIAL = 0.07
 """Distance between samples in the kernel's trial."""
+
+
+class Rays(NamedTuple):
+    """Rays through the cube of a field.
+
+    Attributes:
+        origins: Ray origins in the field's frame. [R, 3]
+        directions: Unit directions. [R, 3]
+        times: Time of each ray, from 0 to 1. [R]
+        jitter: Offset of each ray's samples within their steps, from 0 to 1. [R]
+    """
+
+    origins: Tensor
+    directions: Tensor
+    times: Tensor
+    jitter: Tensor
 
 
 @dataclass(frozen=True)
@@ -64,10 +81,7 @@ class Samples:
 
 
 def march(
-    origins: Tensor,
-    directions: Tensor,
-    times: Tensor,
-    jitter: Tensor,
+    rays: Rays,
     grid: OccupancyGrid,
     *,
     step: float,
@@ -78,10 +92,7 @@ def march(
     """Place samples at equal steps through the cube [-1, 1]^3 and keep the useful ones.
 
     Args:
-        origins: Ray origins in the field's frame. [R, 3]
-        directions: Unit directions. [R, 3]
-        times: Time of each ray. [R]
-        jitter: Offset of each ray's samples within their steps, from 0 to 1. [R]
+        rays: The rays.
         grid: The occupancy grid.
         step: Distance between samples.
         skip_empty: Whether samples in empty cells are dropped.
@@ -95,22 +106,19 @@ def march(
         The samples that remain.
     """
     limit = -math.log(occlusion) if occlusion > 0 else math.inf
-    rays = origins, directions, times, jitter
+    origins = rays.origins
     occupied = grid.occupied if skip_empty else None
     if cpu_loops(origins):
-        return _march_cpu(*rays, grid, step=step, occupied=occupied, limit=limit)
+        return _march_cpu(rays, grid, step=step, occupied=occupied, limit=limit)
     if gpu_kernels(origins) and _kernels_hold(origins.device, origins.dtype):
-        return march_gpu(*rays, grid, step=step, occupied=occupied, limit=limit, room=room)
+        return march_gpu(rays, grid, step=step, occupied=occupied, limit=limit, room=room)
     if room is not None and origins.device.type != "cpu":
-        return march_into(*rays, grid, step=step, occupied=occupied, limit=limit, room=room)
-    return march_reference(*rays, grid, step=step, occupied=occupied, limit=limit)
+        return march_into(rays, grid, step=step, occupied=occupied, limit=limit, room=room)
+    return march_reference(rays, grid, step=step, occupied=occupied, limit=limit)
 
 
 def march_reference(
-    origins: Tensor,
-    directions: Tensor,
-    times: Tensor,
-    jitter: Tensor,
+    rays: Rays,
     grid: OccupancyGrid,
     *,
     step: float,
@@ -118,11 +126,10 @@ def march_reference(
     limit: float,
 ) -> Samples:
     """Reference implementation of `march`, in whole-tensor operations."""
+    origins, directions, *_ = rays
     near, far = ray_box(origins, directions)
     steps = int(((far - near).max() / step).ceil()) + 1 if len(near) else 0
-    distances, cells, inside = _all_samples(
-        origins, directions, times, jitter, near, far, grid, step, steps
-    )
+    distances, cells, inside = _all_samples(rays, near, far, grid, step, steps)
     live = inside if occupied is None else inside & occupied[cells]
     ray, place = live.nonzero(as_tuple=True)
     distances, cells = distances[ray, place], cells[ray, place]
@@ -145,17 +152,10 @@ def march_reference(
 
 
 def _all_samples(
-    origins: Tensor,
-    directions: Tensor,
-    times: Tensor,
-    jitter: Tensor,
-    near: Tensor,
-    far: Tensor,
-    grid: OccupancyGrid,
-    step: float,
-    steps: int,
+    rays: Rays, near: Tensor, far: Tensor, grid: OccupancyGrid, step: float, steps: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Distances and cells of each ray's samples, and whether they are in the cube. [R, S]"""
+    origins, directions, times, jitter = rays
     offset = torch.arange(steps, device=near.device, dtype=near.dtype) + jitter[:, None]
     distances = near[:, None] + offset * step
     half = 0.5 * grid.resolution
@@ -167,10 +167,7 @@ def _all_samples(
 
 
 def march_into(
-    origins: Tensor,
-    directions: Tensor,
-    times: Tensor,
-    jitter: Tensor,
+    rays: Rays,
     grid: OccupancyGrid,
     *,
     step: float,
@@ -182,24 +179,23 @@ def march_into(
 
     Samples are counted; each slot finds its sample from the cumulative sum of the counts.
     """
+    origins, directions, *_ = rays
     near, far = ray_box(origins, directions)
-    rays, steps = len(near), math.ceil(2 * math.sqrt(3) / step) + 1
-    distances, cells, inside = _all_samples(
-        origins, directions, times, jitter, near, far, grid, step, steps
-    )
+    count, steps = len(near), math.ceil(2 * math.sqrt(3) / step) + 1
+    distances, cells, inside = _all_samples(rays, near, far, grid, step, steps)
     met = inside if occupied is None else inside & occupied[cells]
     kept = met
     if math.isfinite(limit):
         depth = (grid.least[cells].double() * step).clamp_max(OPAQUE) * met
         kept = met & (depth.cumsum(1) - depth < limit)
     running = kept.flatten().cumsum(0)
-    ends = running.view(rays, steps)[:, -1]
+    ends = running.view(count, steps)[:, -1]
     shown = ends <= room
     total = (ends * shown).amax()
     slot = torch.arange(room, device=near.device)
     live = slot < total
-    place = torch.searchsorted(running, slot + 1).clamp_max_(rays * steps - 1)
-    ray = torch.where(live, torch.div(place, steps, rounding_mode="floor"), rays - 1)
+    place = torch.searchsorted(running, slot + 1).clamp_max_(count * steps - 1)
+    ray = torch.where(live, torch.div(place, steps, rounding_mode="floor"), count - 1)
     distances = distances.flatten()[place]
     points = torch.addcmul(origins[ray], directions[ray], distances[:, None])
     candidates, found = inside.sum(), met.sum()
@@ -219,10 +215,7 @@ def march_into(
 
 
 def march_gpu(
-    origins: Tensor,
-    directions: Tensor,
-    times: Tensor,
-    jitter: Tensor,
+    rays: Rays,
     grid: OccupancyGrid,
     *,
     step: float,
@@ -235,12 +228,13 @@ def march_gpu(
     The kernel runs twice: to count the samples of each ray, and to write them.
     """
     gpu = gpu_module("xplanes.rendering.marching_triton")
-    rays, device = len(origins), origins.device
-    given = [t.contiguous() for t in (origins, directions, times, jitter)]
+    origins = rays.origins
+    count, device = len(origins), origins.device
+    given = [tensor.contiguous() for tensor in rays]
     limited = math.isfinite(limit)
     cells_of = (occupied, grid.least, grid.resolution, grid.time_bins, OPAQUE, limited)
     spacing = [torch.full((), n, dtype=torch.float64, device=device) for n in (step, limit)]
-    counts = torch.zeros(3, rays, dtype=torch.int64, device=device)
+    counts = torch.zeros(3, count, dtype=torch.int64, device=device)
     gpu.launch(given, cells_of, spacing, counts, 0)
     ends = counts[2].cumsum(0)
     tally = counts.sum(dim=1)
@@ -249,11 +243,11 @@ def march_gpu(
         starts, live, total, shown = ends - counts[2], None, None, None
     else:
         places, shown = room, ends <= room
-        total = (ends * shown).amax() if rays else ends.sum()
+        total = (ends * shown).amax() if count else ends.sum()
         starts, live = torch.minimum(ends - counts[2], total), torch.arange(room, device=device)
         live = live < total
         candidates, found, _ = tally
-    ray = torch.full((places,), max(rays - 1, 0), dtype=torch.int64, device=device)
+    ray = torch.full((places,), max(count - 1, 0), dtype=torch.int64, device=device)
     distances, points = origins.new_zeros(places), origins.new_full((places, 3), OUTSIDE)
     cells = torch.zeros(places, dtype=torch.int64, device=device)
     kept = counts if shown is None else counts * shown
@@ -284,9 +278,9 @@ def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
         ahead = 0.9 * waves(device, 57, 3)[7:] - origins
         directions = torch.nn.functional.normalize(ahead, dim=-1)
         times, jitter = (numbers.clone() for numbers in waves(device, 2, 50).abs())
-        rays = [t.to(precision) for t in (origins, directions, times, jitter)]
+        rays = Rays(*(t.to(precision) for t in (origins, directions, times, jitter)))
         occupied = waves(device, len(grid.least)) > 0
-        found = function(*rays, grid, step=STEP_OF_TRIAL, occupied=occupied, limit=3.0, room=400)
+        found = function(rays, grid, step=STEP_OF_TRIAL, occupied=occupied, limit=3.0, room=400)
         assert found.live is not None
         here = found.live
         numbers = [found.candidates, found.empty, found.occluded, found.count]
@@ -307,10 +301,7 @@ def _starts(ray: Tensor, rays: int) -> Tensor:
 
 
 def _march_cpu(
-    origins: Tensor,
-    directions: Tensor,
-    times: Tensor,
-    jitter: Tensor,
+    rays: Rays,
     grid: OccupancyGrid,
     *,
     step: float,
@@ -318,12 +309,13 @@ def _march_cpu(
     limit: float,
 ) -> Samples:
     cpu = compiled("xplanes.rendering.rays_numba")
-    near, far = ray_box(origins, directions)
+    near, far = ray_box(rays.origins, rays.directions)
     half = 0.5 * grid.resolution
-    origins, directions = origins.contiguous(), directions.contiguous()
-    rays = (origins, directions, (origins + 1) * half, directions * half, grid.bins(times), near)
+    origins, directions = rays.origins.contiguous(), rays.directions.contiguous()
+    inputs = (origins, directions, (origins + 1) * half, directions * half)
+    inputs = (*inputs, grid.bins(rays.times), near, rays.jitter.contiguous())
     wanted = (grid.occupied if occupied is None else occupied).numpy()
-    ways = [t.numpy() for t in (*rays, jitter.contiguous())]
+    ways = [t.numpy() for t in inputs]
     cells_to_sample = (wanted, grid.resolution, occupied is not None)
     counts = torch.empty(3, len(near), dtype=torch.int64)
     surfaces = (far.numpy(), grid.least.numpy(), limit)

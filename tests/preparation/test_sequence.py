@@ -141,7 +141,7 @@ WRONG = {
     ),
     "mirrored": (
         {"triplanes": GOOD, "frame": {"scale": 1, "rotation": -ROTATION, "centre": [0, 0, 0]}},
-        "no rotation",
+        "not a rotation",
     ),
 }
 

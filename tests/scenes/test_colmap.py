@@ -479,10 +479,13 @@ def test_captures_without_folders_have_no_cameras(capture):
 
 def test_settings_that_cannot_work(capture):
     for words, changes in (
-        (r"time_pattern=\(: is no regular expression", {"time_pattern": "("}),
+        (r"time_pattern=\(: is not a regular expression", {"time_pattern": "("}),
         (r"must have one group.*it has 0", {"time_pattern": "frame"}),
         (r"must have one group.*it has 2", {"time_pattern": r"(\d)(\d)"}),
-        (r"file names tell no times with times=rank", {"time_pattern": r"(\d)", "times": "rank"}),
+        (
+            r"not read from file names with times=rank",
+            {"time_pattern": r"(\d)", "times": "rank"},
+        ),
         ("eval_every=0", {"eval_every": 0}),
     ):
         assert_refused(ConfigError, words, partial(capture.settings, **changes), changes)

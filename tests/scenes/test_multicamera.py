@@ -283,7 +283,7 @@ def test_the_video_is_that_of_a_training_camera(videos: Path) -> None:
     assert video.times.tolist() == pytest.approx(torch.linspace(0, 1, FRAMES).tolist())
     assert read(videos, splits=("train",), video_camera="cam03").video.files[0][:5] == "cam03"
     for name in ("cam00", "cam9"):
-        words = f"video_camera={name} is no training camera.*must not see.*cam01, cam02"
+        words = f"video_camera={name} is not a training camera.*must not see.*cam01, cam02"
         with pytest.raises(SceneError, match=words):
             read(videos, video_camera=name)
 
@@ -439,9 +439,9 @@ def test_damaged_files_are_named(videos: Path, tmp_path: Path) -> None:
     (folder / "poses_bounds.npy").unlink()
     refused(r"neither poses_bounds\.npy .* nor transforms\.json .*cam00\.mp4")
     for name, match in (
-        ("cam05.mp4", "is no video"),
+        ("cam05.mp4", "is not a video"),
         ("../other", "leaves the scene's folder"),
-        ("/cam05.mp4", "is no video"),
+        ("/cam05.mp4", "is not a video"),
         ("", "must be text"),
         (".", "is the scene's folder"),
     ):

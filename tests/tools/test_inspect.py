@@ -484,7 +484,7 @@ def test_errors_are_one_line_and_leave_1(tmp_path, monkeypatch, capsys):
     )
     cases = [
         (["missing"], "missing is not a folder"),
-        (["."], r"no scene of a known format. Scenes inside it: away, ball"),
+        (["."], r"not a scene of a known format. Scenes inside it: away, ball"),
         (["ball", "ball"], "give one folder"),
         (["ball", "--out", "ball/a.png"], "the scene's own folder"),
         (["ball", "--out", "a.jpg"], "must end in .png"),
@@ -516,7 +516,7 @@ def test_a_format_of_ones_own_joins(tmp_path, monkeypatch):
     folder.mkdir()
     (folder / "discs.txt").write_text("six")
     plugin = ["plugins=[tests.plugins]", f"hydra.searchpath=[file://{tmp_path}/conf]"]
-    assert_refused(SceneError, "no scene of a known", lambda: choose([str(folder)]), "unknown")
+    assert_refused(SceneError, "not a scene of a known", lambda: choose([str(folder)]), "unknown")
     assert choose([str(folder), *plugin]).scene.name == "disc"
 
 
@@ -534,7 +534,7 @@ def test_a_run_says_what_cameras_and_times_tell(tmp_path, caplog, monkeypatch):
     def stop(*_: object) -> None:
         raise SceneError("far enough")
 
-    monkeypatch.setattr(run, "Initialisation", stop)
+    monkeypatch.setattr(run, "initialisation_of", stop)
     with pytest.raises(SceneError, match="far enough"):
         run.run(config, tmp_path / "run", [], resume=False)
     said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]

@@ -48,8 +48,8 @@ def rendering_method(method: Method, views: Views, hints: CubeHints = NO_HINTS) 
     found = Method.read(compose_plain("train", [f"model={name}", "lrm=none"]))
     if found.model.sampler.kind is not RadianceField:
         raise ConfigError(
-            f"preparation.fixed_view_model={name}: its renderer takes no single rays; choose a "
-            "model with a radiance field, such as six_planes"
+            f"preparation.fixed_view_model={name}: its renderer draws whole images, not single "
+            "rays; choose a model with a radiance field, such as six_planes"
         )
     model = found.model.for_scene(views, hints)
     model = replace(model, sampler=model.sampler.for_video(), precision=method.model.precision)

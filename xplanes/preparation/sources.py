@@ -50,7 +50,7 @@ class BundledLRMSettings(ImageLRMSettings):
             own = Path(self.weights)
             if own.suffix != ".safetensors" or not own.is_file():
                 raise LRMError(
-                    f"{own} is no file that ends in .safetensors: name one that xplanes "
+                    f"{own} is not a .safetensors file: name one that xplanes "
                     "pretrain-lrm wrote, with its .json beside it"
                 )
             model, path = load_bundled(own.stem, own.parent)

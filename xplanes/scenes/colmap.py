@@ -81,14 +81,14 @@ class ColmapSettings(CaptureSettings):
             return
         if self.times is not None:
             raise ConfigError(
-                f"time_pattern={self.time_pattern}: file names tell no times with "
-                f"times={self.times}; set one of the two to null"
+                f"time_pattern={self.time_pattern}: times are not read from file "
+                f"names with times={self.times}; set one of the two to null"
             )
         try:
             groups = re.compile(self.time_pattern).groups
         except re.error as problem:
             raise ConfigError(
-                f"time_pattern={self.time_pattern}: is no regular expression ({problem}); write "
+                f"time_pattern={self.time_pattern}: is not a regular expression ({problem}); write "
                 r"one such as frame_(\d+)"
             ) from problem
         if groups != 1:

@@ -150,7 +150,7 @@ def check_frame(frame: Frame, name: str) -> None:
     gap = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
     # The negated comparison also refuses NaN.
     if not gap < 1e-3 or torch.linalg.det(rotation) < 0:
-        raise SceneError(f"{name}: frame.rotation is no rotation (orthonormal, determinant 1)")
+        raise SceneError(f"{name}: frame.rotation is not a rotation (orthonormal, determinant 1)")
 
 
 def cube_frame(half_side: float, centre: Tensor, source: str = "") -> Frame:

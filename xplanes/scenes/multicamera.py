@@ -386,8 +386,8 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
             f"{model.source}: {some(problems)}. One image of each camera must be registered, and "
             "have its name: cam00.png or cam00/0001.png for cam00.mp4, or for the folder cam00. "
             f"Registered images: {some(model.names)}. Videos, and folders of the name cam*, in "
-            f"{folder}: {some([path.name for path in expected]) or 'none'}. Move what is no camera "
-            "elsewhere, or read all registered images with data=colmap."
+            f"{folder}: {some([path.name for path in expected]) or 'none'}. Move what is not a "
+            "camera elsewhere, or read all registered images with data=colmap."
         )
     return cameras
 
@@ -401,9 +401,9 @@ def _source(label: str, folder: Path, name: Any) -> Path:
             return source.parent
     else:
         raise SceneError(
-            f"{label}: {folder / name} is no video ({', '.join(videos.SUFFIXES)}), no folder "
-            "of images and no image in a folder of one camera. Add it, or remove the frame "
-            "from the list."
+            f"{label}: {folder / name} is not a video ({', '.join(videos.SUFFIXES)}), a folder "
+            "of images or an image in a folder of one camera. Add it, or remove the frame from "
+            "the list."
         )
     if source == folder:
         raise SceneError(f"{label}: file_path is the scene's folder, not that of one camera.")
@@ -452,10 +452,10 @@ def _video_camera(cameras: Sequence[Camera], parts: dict[str, list[int]], name: 
         return min(train, key=lambda index: away[index])
     found = [index for index, camera in enumerate(cameras) if camera.name == name]
     if not found or found[0] not in train:
+        others = ", ".join(cameras[index].name for index in train)
         raise SceneError(
-            f"data.video_camera={name} is no training camera, and the LRM must not see frames that "
-            f"are scored. Name one of {', '.join(cameras[index].name for index in train)}, or null "
-            "for the most central."
+            f"data.video_camera={name} is not a training camera, and the LRM must not see frames "
+            f"that are scored. Name one of {others}, or null for the most central."
         )
     return found[0]
 

@@ -174,7 +174,7 @@ def _recognised(folder: Path, changed: Sequence[str]) -> tuple[Path, str]:
     there = [f"{path.name}{'/' * path.is_dir()}" for path in folder.iterdir()]
     wanted = "; ".join(f"{name}: {cls.files}" for cls, name in known.items() if cls.files)
     raise SceneError(
-        f"{folder} is no scene of a known format.{scenes} It contains "
+        f"{folder} is not a scene of a known format.{scenes} It contains "
         f"{some(sorted(there)) or 'nothing'}. What the formats need: {wanted}. Choose one with "
         "data=NAME"
     )

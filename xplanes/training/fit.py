@@ -324,8 +324,8 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
         later = _seconds(lambda: renderer.image(solid, origins, directions, *seen_at), device)
         if (background := getattr(field, "background", None)) is not None:
             with torch.no_grad():
-                rays = origins, directions
-                later += BEHIND * _seconds(lambda: background_colour(background, *rays), device)
+                seen = origins, directions
+                later += BEHIND * _seconds(lambda: background_colour(background, *seen), device)
     return Estimate(taken, first / len(chosen), later / len(chosen), pruned_at)
 
 

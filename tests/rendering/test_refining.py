@@ -98,6 +98,7 @@ def batches_of(views, rays=2048):
         skip_background=False,
         background_share=1.0,
         background_jitter=0.0,
+        error_share=0.0,
     )
     batches = RayBatches(views, FRAME, settings, seed=0)
     batches.add_slopes()

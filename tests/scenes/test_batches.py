@@ -28,6 +28,7 @@ SETTINGS = RaySettings(
     skip_background=True,
     background_share=0.1,
     background_jitter=0.0,
+    error_share=0.0,
 )
 
 

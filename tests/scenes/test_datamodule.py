@@ -22,6 +22,7 @@ RAYS = RaySettings(
     skip_background=True,
     background_share=0.1,
     background_jitter=0.0,
+    error_share=0.0,
 )
 
 

@@ -38,6 +38,7 @@ RAYS = RaySettings(
     skip_background=False,
     background_share=0.1,
     background_jitter=0.0,
+    error_share=0.0,
 )
 
 

@@ -52,7 +52,7 @@ def test_a_video_that_is_not_there_is_refused(config, tmp_path):
     (tmp_path / folder.name / "transforms_video.json").unlink()
     shared = {name: getattr(config, name) for name in ("resolution", "views", "static")}
     values = shared | dict.fromkeys(("eval_views", "half_side", "centre", "cache"))
-    values |= {"eval_split": "test", "refine_cameras": False}
+    values |= {"eval_split": "test", "refine_cameras": False, "mask_use": "auto"}
     values |= {"name": "dnerf", "root": str(tmp_path), "scene": folder.name}
     with pytest.raises(SceneError, match=r"no video of a fixed camera.*set it to false"):
         BlenderSettings(**values, train_on_video=True).read()

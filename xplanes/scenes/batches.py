@@ -138,7 +138,7 @@ class RaySettings(BatchSettings):
     background_jitter: Share  # Maximum random time offset of these rays.
     # Share of rays that are drawn in proportion to the error of the field where their pixels lie.
     # Weights in the loss make up for it. For images in memory; 0: none.
-    error_share: Share = 0.0
+    error_share: Share
 
     def on(self, device: torch.device) -> "RaySettings":
         if device.type == "cpu":

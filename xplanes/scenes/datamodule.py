@@ -29,6 +29,7 @@ UNIFORM = RaySettings(
     skip_background=False,
     background_share=1.0,
     background_jitter=0.0,
+    error_share=0.0,
 )
 """Batches for a LightningModule that does not specify any."""
 

@@ -28,7 +28,7 @@ class BlenderSettings(SceneSettings):
 
     # Use of masked-out pixels. alpha: empty space; ignore: neither trained on nor scored; auto:
     # alpha if masks look like silhouettes, else ignore; lrm: only the LRM's input is masked.
-    mask_use: MaskUse = "auto"
+    mask_use: MaskUse
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:

@@ -224,6 +224,7 @@ def test_a_missing_split_is_held_out_of_training_or_nothing_is_the_best(
     data = {name: value for name, value in demo["data"].items() if name in known}
     target = "xplanes.scenes.dnerf.BlenderSettings"
     data |= {"_target_": target, "root": str(tmp_path / "scenes"), "scene": "few"}
+    data["mask_use"] = "auto"
     done = tmp_path / "run"
     run(demo | {"data": data}, done, [], resume=False)
     metrics = json.loads((done / "metrics.json").read_text())

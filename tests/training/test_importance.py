@@ -7,6 +7,7 @@ import torch
 
 from tests.training.runs import checkpoint, small_config
 from xplanes.run import run
+from xplanes.scenes import importance
 from xplanes.training import module
 from xplanes.training.module import RadianceModule
 
@@ -14,8 +15,8 @@ from xplanes.training.module import RadianceModule
 @pytest.fixture
 def soon(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, bool]]:
     """Importance sampling from the fourth batch on; batches and whether their rays are weighted."""
-    monkeypatch.setattr(module, "IMPORTANCE_FROM", 3)
-    monkeypatch.setattr(module, "REFRESH", 3)
+    monkeypatch.setattr(module, "START", 3)
+    monkeypatch.setattr(importance, "REFRESH", 3)
     drawn: list[tuple[int, bool]] = []
     step = RadianceModule.training_step
 
@@ -62,4 +63,4 @@ def test_a_checkpoint_without_a_map_is_read(
     content = checkpoint(tmp_path)
     del content["error_map"]
     torch.save(content, path)
-    assert RadianceModule.load_from_checkpoint(path).errors is None
+    assert RadianceModule.load_from_checkpoint(path).error_map.errors is None

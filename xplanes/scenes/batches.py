@@ -400,7 +400,7 @@ class RayBatches(Batches):
             more["tile"] = self.tiles.number(*place)
         if errors is not None:
             offset = uniform[-1, 2]  # The jitter of rays uses only the first of these numbers.
-            candidates = errors[more["tile"]]
+            candidates = errors.to(pixel.device)[more["tile"]]
             chosen, weight = preferred(candidates, self.error_share, rays, offset)
             more = {"tile": more["tile"][chosen], "weight": weight}
             far, pixel = far[chosen], pixel[chosen]

@@ -86,9 +86,9 @@ class SceneDataModule(LightningDataModule):
 
     @property
     def errors(self) -> Tensor | None:
-        """Errors by tile, if the LightningModule sets them (``errors``), see `Batches.draw`."""
+        """Errors by tile, if the LightningModule has an ``error_map``, see `Batches.draw`."""
         module = None if self.trainer is None else self.trainer.lightning_module
-        return getattr(module, "errors", None)
+        return getattr(getattr(module, "error_map", None), "errors", None)
 
     @classmethod
     def of(cls, scene: Scene, *, seed: int = 0) -> "SceneDataModule":

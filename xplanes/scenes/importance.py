@@ -1,12 +1,12 @@
 """Importance sampling of rays: more of them where images are not reproduced yet."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, distributed
 
 from xplanes.scenes.views import Views
 
@@ -21,6 +21,9 @@ CANDIDATES = 4
 
 REFRESH, KEPT = 50, 0.84
 """Batches between updates of the errors in use, and the weight that older batches keep."""
+
+START = 300
+"""Batches before pixels are preferred: errors are large everywhere at first."""
 
 LEAST = 0.02
 """Least error of a tile, relative to the mean: errors of dark tiles are underestimated."""
@@ -83,38 +86,47 @@ def _tiles(views: Views, side: int) -> int:
 class ErrorMap:
     """Recent mean colour error of each tile, for `preferred`.
 
+    Args:
+        start: Batches before the errors are used.
+
     Attributes:
         errors: Square root of each tile's mean squared error; that of all tiles where unknown. None
-            before the first update. [MOST_TILES]
+            before they are used. [MOST_TILES]
     """
 
-    def __init__(self) -> None:
+    def __init__(self, start: int = START) -> None:
+        self.start, self.batches = start, 0
         self.errors: Tensor | None = None
         self._sums = torch.zeros(0)
         """Squared errors and their number: until the last update over all processes, and since
         then in this one; empty before the first batch. [2, 2, MOST_TILES]"""
 
-    def observe(self, tile: Tensor, error: Tensor) -> None:
-        """Add the squared errors of a batch. int64 [R], [R]"""
+    def observe(self, batch: Mapping[str, Any], colour: Tensor) -> None:
+        """Add the errors of a rendered batch, if it has tiles.
+
+        Args:
+            batch: With ``tile``, int64 [R], and ``target`` [R, 3].
+            colour: Colours of its rays. [R, 3]
+        """
+        if (tile := batch.get("tile")) is None:
+            return
+        error = (colour.detach() - batch["target"]).square().mean(dim=1)
         if not len(self._sums):
             self._sums = torch.zeros(2, 2, MOST_TILES)
         if self._sums.device != error.device:
             self._sums = self._sums.to(error.device)
-        _, fresh = self._sums
+        fresh = self._sums[1]
         fresh[0].index_add_(0, tile, error)
         fresh[1].index_add_(0, tile, torch.ones_like(error))
-
-    def update(self, total: Callable[[Tensor], Tensor]) -> None:
-        """Bring the errors in use up to date.
-
-        Args:
-            total: Sums a tensor over all processes.
-        """
-        recent, fresh = self._sums
-        # A batch that is not finite must not remain in the sums.
-        recent = (KEPT * recent + total(fresh)).nan_to_num(0.0, 0.0, 0.0)
-        self._sums = torch.stack([recent, torch.zeros_like(recent)])
-        self.errors = self._errors()
+        self.batches += 1
+        if self.batches % REFRESH == 0:
+            if distributed.is_available() and distributed.is_initialized():
+                distributed.all_reduce(fresh)
+            # A batch that is not finite must not remain in the sums.
+            self._sums[0].mul_(KEPT).add_(fresh).nan_to_num_(0.0, 0.0, 0.0)
+            fresh.zero_()
+        if self.batches >= self.start and (self.errors is None or self.batches % REFRESH == 0):
+            self.errors = self._errors()
 
     def _errors(self) -> Tensor:
         error, count = self._sums[0]
@@ -124,7 +136,7 @@ class ErrorMap:
 
     def state_dict(self) -> dict[str, Any]:
         """Its content, for a checkpoint."""
-        return {"sums": self._sums, "updated": self.errors is not None}
+        return {"sums": self._sums, "batches": self.batches}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from the content of a checkpoint.
@@ -132,5 +144,6 @@ class ErrorMap:
         Raises:
             KeyError, TypeError: If the content is of another kind.
         """
-        self._sums = state["sums"]
-        self.errors = self._errors() if state["updated"] else None
+        self._sums, self.batches = state["sums"], state["batches"]
+        used = len(self._sums) and self.batches >= self.start
+        self.errors = self._errors() if used else None

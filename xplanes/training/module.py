@@ -22,7 +22,7 @@ from xplanes.rendering.base import Renderer, Rendering
 from xplanes.rendering.sampler import Sampler, Site
 from xplanes.scenes.batches import Batch, BatchSettings
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.importance import REFRESH, ErrorMap
+from xplanes.scenes.importance import START, ErrorMap
 from xplanes.scenes.views import Scene
 from xplanes.streams import TrainingState
 from xplanes.training.building import (
@@ -48,9 +48,6 @@ from xplanes.training.scores import ViewScoring
 
 PATIENCE = 20
 """Training fails after this many consecutive updates with a loss or gradient that is not finite."""
-
-IMPORTANCE_FROM = 300
-"""Batches before rays are preferred where errors are large; earlier all errors are."""
 
 OPACITIES = 5
 """Batches between measurements of the rays' opacity."""
@@ -100,7 +97,6 @@ class RadianceModule(ViewScoring):
         """Whether no accumulated gradients are pending (see ``accumulate_grad_batches``)."""
         self.scores = []
         self.tally = Tally()
-        self.error_map = ErrorMap()
         self._parts: Parts | None = None
         self._seen: tuple[Rendering, dict[str, Tensor]] | None = None
         self._losses: list[Tensor] = []
@@ -191,7 +187,7 @@ class RadianceModule(ViewScoring):
 
     def _adopt(self, parts: Parts) -> None:
         self._parts = parts
-        self.field = parts.field
+        self.field, self.error_map = parts.field, ErrorMap(parts.site.steps(START))
         for name, part in parts.sampler.parts.items():
             self.add_module(name, part)
         self.rays = parts.sampler.first_rays(self.ray_settings.most)
@@ -302,7 +298,7 @@ class RadianceModule(ViewScoring):
         self._losses.append(loss.detach())
         self._seen = rendering, terms
         self.batches += 1
-        self._map_errors(rendering, batch)
+        self.error_map.observe(batch, rendering.colour)
         self.between_updates = False
         self._count(rendering, batch, loss)
         log_terms(self, terms, state)
@@ -348,26 +344,6 @@ class RadianceModule(ViewScoring):
     def on_train_end(self) -> None:
         self._read_tally()
 
-    @property
-    def errors(self) -> Tensor | None:
-        """Errors by tile, for importance sampling of the next batch's rays; None for none."""
-        mapped = self.batches >= self.site.steps(IMPORTANCE_FROM)
-        return self.error_map.errors if mapped else None
-
-    def _map_errors(self, rendering: Rendering, batch: Batch) -> None:
-        if (tile := batch.get("tile")) is None:
-            return
-        error = (rendering.colour.detach() - batch["target"]).square().mean(dim=1)
-        self.error_map.observe(tile, error)
-        if self.batches % REFRESH == 0:
-            self.error_map.update(self._total)
-
-    def _total(self, values: Tensor) -> Tensor:
-        """Sum over all processes, on all of them."""
-        if self.trainer.world_size > 1:
-            torch.distributed.all_reduce(values)
-        return values
-
     def _count(self, rendering: Rendering, rays: Batch, loss: Tensor) -> None:
         """Add the statistics of a batch; the host reads them later."""
         # With a learnt background it is unknown which pixels are opaque or empty.
@@ -407,7 +383,6 @@ class RadianceModule(ViewScoring):
         device, optimizer = self.device, self._optimizer
         self._adopt(self.parts.stronger())
         self.restarts += 1
-        self.error_map = ErrorMap()
         self.to(device)
         fresh = [*self.model.groups(), *self.sampler.groups()]
         for group, new in zip(optimizer.param_groups, fresh, strict=True):
@@ -422,9 +397,9 @@ class RadianceModule(ViewScoring):
         own = {"batches": self.batches, "rays": self.rays, "restarts": self.restarts}
         checkpoint["xplanes"] = __version__
         checkpoint["progress"] = own | self.tally.state_dict()
-        checkpoint["error_map"] = self.error_map.state_dict()
         if self._parts is not None:
             checkpoint["site"] = site_content(self._parts)
+            checkpoint["error_map"] = self.error_map.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         try:

@@ -80,7 +80,7 @@ def test_fit_logs_every_term_of_the_loss_validates_and_keeps_the_best(fitted):
     assert values["train/loss"][0] > values["train/loss"][-1]
     # An epoch is as many rays as the views have pixels.
     assert len(values["val/psnr"]) == 45 // (10 * 32 * 32 // 1024)
-    assert values["val/psnr"][-1] > values["val/psnr"][0] + 1
+    assert values["val/psnr"][-1] > values["val/psnr"][0] + 0.5
     assert used.callback_metrics["val/psnr"] == pytest.approx(values["val/psnr"][-1])
     assert (folder / "best.ckpt").is_file()
     assert module.global_step == 45

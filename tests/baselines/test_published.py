@@ -64,6 +64,7 @@ OURS = (
     "model.rays.background=white",
     "model.rays.background_share=0.4",
     "model.rays.background_jitter=0.1",
+    "model.rays.error_share=0.5",
 )
 """The rays of X-Planes, for models that bring others."""
 

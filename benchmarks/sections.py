@@ -321,7 +321,7 @@ def why_stale(section: Section) -> str:
         for key in sorted({*then, *settings}):
             old, new = then.get(key), settings.get(key)
             # A setting that did not exist, and is off now, changes nothing.
-            if old != new and (key in then or new is not False):
+            if old != new and (key in then or new not in (False, 0, None)):
                 changes.setdefault(f"{key} went from {old} to {new}", []).append(case)
     for words, cases in list(changes.items()):
         if len(cases) == 1 < len(now):

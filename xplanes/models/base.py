@@ -42,9 +42,11 @@ class Model(ABC):
 
     Attributes:
         advice: What to change when the loss is not finite, for the error message.
+        betas: Adam's decay rates.
     """
 
     advice: str = "Lower the model's learning rates"
+    betas: tuple[float, float] = (0.9, 0.999)
 
     @property
     @abstractmethod
@@ -65,7 +67,7 @@ class Model(ABC):
         Args:
             groups: Parameter groups of the field and the sampler.
         """
-        return torch.optim.Adam(groups, eps=1e-15, fused=True)
+        return torch.optim.Adam(groups, betas=self.betas, eps=1e-15, fused=True)
 
     @abstractmethod
     def rate(self, step: int, progress: float) -> float:

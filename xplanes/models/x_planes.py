@@ -40,10 +40,6 @@ from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
 from xplanes.streams import Stream, TrainingState, step_generator
 
-BETAS = 0.9, 0.95
-"""Adam's decay rates. Rays reach a texel at irregular intervals: with a long memory of squared
-gradients, the steps of texels that are rarely reached would be far too large."""
-
 FINE_WARMUP = 100
 """Warm-up steps of the fine planes' learning rate."""
 
@@ -260,6 +256,10 @@ class XPlanesModel(Model):
         initial: Initial values; None for a random initialisation.
     """
 
+    # Rays reach a texel at irregular intervals: with a long memory of squared gradients, the steps
+    # of texels that are rarely reached would be far too large.
+    betas = 0.9, 0.95
+
     def __init__(
         self,
         settings: XPlanesSettings,
@@ -325,9 +325,6 @@ class XPlanesModel(Model):
         if field.background is not None and settings.background is not None:
             groups += settings.background.groups(field.background)
         return groups
-
-    def optimizer(self, groups: list[Group]) -> torch.optim.Optimizer:
-        return torch.optim.Adam(groups, betas=BETAS, eps=1e-15, fused=True)
 
     def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         terms = super().losses(rendering, rays, state)

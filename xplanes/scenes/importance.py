@@ -47,9 +47,11 @@ class Tiles:
     def of(cls, views: Views) -> "Tiles":
         """Tiles of the smallest side for which there are at most `MOST_TILES`, if possible."""
         side = SIDE
-        while len(views) * _tiles(views, side) > MOST_TILES and side < views.width:
+        while True:
+            rows, columns = math.ceil(views.height / side), math.ceil(views.width / side)
+            if len(views) * rows * columns <= MOST_TILES or rows * columns == 1:
+                return cls(side, rows, columns)
             side *= 2
-        return cls(side, math.ceil(views.height / side), math.ceil(views.width / side))
 
     def number(self, view: Tensor, row: Tensor, column: Tensor) -> Tensor:
         """Number of the tile of each pixel. int64 [R] each -> int64 [R]"""
@@ -78,16 +80,11 @@ def preferred(errors: Tensor, share: float, count: int, offset: Tensor) -> tuple
     return chosen, (ends[-1] / len(errors) / chance).float()
 
 
-def _tiles(views: Views, side: int) -> int:
-    """Number of tiles of an image."""
-    return math.ceil(views.height / side) * math.ceil(views.width / side)
-
-
 class ErrorMap:
     """Recent mean colour error of each tile, for `preferred`.
 
     Args:
-        start: Batches before the errors are used.
+        start: Batches before the errors are used, from the next update on.
 
     Attributes:
         errors: Square root of each tile's mean squared error; that of all tiles where unknown. None
@@ -125,10 +122,11 @@ class ErrorMap:
             # A batch that is not finite must not remain in the sums.
             self._sums[0].mul_(KEPT).add_(fresh).nan_to_num_(0.0, 0.0, 0.0)
             fresh.zero_()
-        if self.batches >= self.start and (self.errors is None or self.batches % REFRESH == 0):
             self.errors = self._errors()
 
-    def _errors(self) -> Tensor:
+    def _errors(self) -> Tensor | None:
+        if self.batches - self.batches % REFRESH < max(self.start, 1):
+            return None
         error, count = self._sums[0]
         overall = error.sum() / count.sum().clamp_min(1) + torch.finfo(error.dtype).tiny
         mean = torch.where(count > 0, error / count.clamp_min(1e-6), overall)
@@ -145,5 +143,4 @@ class ErrorMap:
             KeyError, TypeError: If the content is of another kind.
         """
         self._sums, self.batches = state["sums"], state["batches"]
-        used = len(self._sums) and self.batches >= self.start
-        self.errors = self._errors() if used else None
+        self.errors = self._errors()

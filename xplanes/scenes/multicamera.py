@@ -59,8 +59,8 @@ TRANSFORMS = "transforms.json"
 NUMBERED = re.compile(r"(?i)((view|camera|c|v)[_-]?\d+|\d\d+)")
 """Pattern of camera names other than cam*."""
 
-MOMENTS = "mv_images"
-"""Folder with a subfolder for each moment, as in Nvidia's Dynamic Scenes."""
+TIMESTEPS = "mv_images"
+"""Folder with a subfolder for each timestep, as in Nvidia's Dynamic Scenes."""
 
 IMAGES = ("images", "image", "rgb", "frames")
 """Names of the subfolder with a camera's images, if the camera has several subfolders."""
@@ -243,7 +243,7 @@ def _recordings(folder: Path) -> list[Path]:
     """Recordings in a folder, or in its only subfolder that has some, such as videos."""
     if found := recordings_of_cameras(folder):
         return found
-    inside = [path for path in folder.iterdir() if path.is_dir() and path.name != MOMENTS]
+    inside = [path for path in folder.iterdir() if path.is_dir() and path.name != TIMESTEPS]
     deeper = [paths for path in inside if (paths := recordings_of_cameras(path))]
     return deeper[0] if len(deeper) == 1 else []
 
@@ -528,7 +528,7 @@ def _are_stamped(recordings: Sequence[Recording]) -> bool:
 
 
 def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
-    """The recordings without images of moments that some camera lacks; warns about these.
+    """The recordings without images of timesteps that some camera lacks; warns about these.
 
     Images of equal numbers are simultaneous. If the cameras' numbers do not overlap, they are
     counted from the first of each camera.

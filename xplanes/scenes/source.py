@@ -71,12 +71,13 @@ def warn_of_masks(folder: Path, images: Sequence[Path]) -> None:
         images: Its images, without masks.
     """
     folder, images = folder.resolve(), [path.resolve() for path in images]
-    places, used = {path.parent for path in images}, {*images}
+    places = {path.parent for path in images}
+    used = {*images, *places}
     found = sorted(
         path
         for place in {folder, *places}
         for path in place.iterdir()
-        if "mask" in path.name.lower() and path not in {*used, *places}
+        if "mask" in path.name.lower() and path not in used
         if path.is_dir() or is_image(path)
     )
     if found:

@@ -146,9 +146,7 @@ class FakeTensor(torch.Tensor):
             result = func(*raw_args, **raw_kwargs)
         own = {id(t.raw): t for t in _tensors(args, kwargs)}
         return tree_map_only(
-            torch.Tensor,
-            lambda raw: own[id(raw)] if id(raw) in own else FakeTensor(raw),
-            result,
+            torch.Tensor, lambda raw: own[id(raw)] if id(raw) in own else FakeTensor(raw), result
         )
 
 

@@ -63,8 +63,4 @@ def direction(model, target, k, focal, centre, skew=0.0, widest=math.pi):
         turn -= error
         if abs(error) < 1e-15:
             break
-    return (
-        math.sin(low) * math.cos(turn),
-        -math.sin(low) * math.sin(turn),
-        -math.cos(low),
-    )
+    return (math.sin(low) * math.cos(turn), -math.sin(low) * math.sin(turn), -math.cos(low))

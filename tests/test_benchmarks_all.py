@@ -42,7 +42,7 @@ def section(sections: Any, settings: dict, rows: list[dict], **about: Any) -> An
     )
 
 
-def test_a_record_is_stale_when_settings_of_what_it_measured_have_changed(records) -> None:
+def test_a_record_is_stale_when_settings_of_what_it_measured_have_changed(records):
     case = {"model.name": "six_planes", "model.loss.opacity": 0.1}
     rows = [{"case": "one", "psnr": 1 / 3}, {"case": "two", "psnr": 2.0}]
     old = section(records, {"one": case, "two": {**case, "seeds": 3}}, rows)
@@ -66,7 +66,7 @@ def test_a_record_is_stale_when_settings_of_what_it_measured_have_changed(record
     assert "version 1" in records.why_stale(old)
 
 
-def test_what_does_not_change_a_measurement_is_not_among_its_settings(records) -> None:
+def test_what_does_not_change_a_measurement_is_not_among_its_settings(records):
     def settings(*changes: str) -> dict:
         return records.settings_of(("data.scene=balls", *changes))
 
@@ -76,7 +76,7 @@ def test_what_does_not_change_a_measurement_is_not_among_its_settings(records) -
         assert settings(changed) != settings(), changed
 
 
-def test_a_repeated_measurement_is_compared_with_its_record(records) -> None:
+def test_a_repeated_measurement_is_compared_with_its_record(records):
     then = [{"case": "one", "psnr": 20.0, "psnr_std": 0.5}, {"case": "two", "psnr": 20.0}]
     records.write_record("some", {"version": "1"}, {}, then)
     now = [{"case": "one", "psnr": 21.4}, {"case": "two", "psnr": 21.4}, {"case": "three"}]
@@ -88,9 +88,7 @@ def test_a_repeated_measurement_is_compared_with_its_record(records) -> None:
     assert [bool(line[4]) for line in found] == [False, True]
 
 
-def test_rows_have_means_and_deviations_and_wait_for_all_runs(
-    records, monkeypatch, tmp_path
-) -> None:
+def test_rows_have_means_and_deviations_and_wait_for_all_runs(records, monkeypatch, tmp_path):
     folders: list[Path] = []
 
     def run(overrides: list[str], folder: Path, script: Path) -> Any:
@@ -128,7 +126,7 @@ def test_rows_have_means_and_deviations_and_wait_for_all_runs(
     assert [row["case"] for row in caught.value.rows] == ["b"]
 
 
-def test_measuring_writes_a_record_and_its_page(every, records, monkeypatch, tmp_path) -> None:
+def test_measuring_writes_a_record_and_its_page(every, records, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     page = tmp_path / "page.md"
     page.write_text("Words.\n\n<!-- measured: some -->\nOld.\n<!-- end -->\n\nMore.\n")
@@ -152,7 +150,7 @@ def test_measuring_writes_a_record_and_its_page(every, records, monkeypatch, tmp
 STALE = re.compile(r"^\*\*Stale\*\*: .*\n\n", re.MULTILINE)
 
 
-def test_pages_show_what_the_records_say(every, monkeypatch) -> None:
+def test_pages_show_what_the_records_say(every, monkeypatch):
     monkeypatch.setattr(every.sections, "why_stale", lambda section: "")
     known, tables, seen = every.every_section(), every.summaries(), []
     for name in every.MODULES:
@@ -169,18 +167,18 @@ def test_pages_show_what_the_records_say(every, monkeypatch) -> None:
 
 
 @pytest.mark.slow
-def test_settings_of_all_cases_exist(every) -> None:
+def test_settings_of_all_cases_exist(every):
     for name, section in every.every_section().items():
         assert all(section.settings().values()), name
 
 
-def test_printed_commands_name_no_folder(every) -> None:
+def test_printed_commands_name_no_folder(every):
     words = ["--lego", "/there/lego", "data.root=/there", "data.scene=lego", "--seeds", "3"]
     printed = ["--lego", "FOLDER", "data.root=FOLDER", "data.scene=lego", "--seeds", "3"]
     assert sys.modules["runner"].without_folders(words) == printed
 
 
-def test_stages_that_are_timed_exist(every) -> None:
+def test_stages_that_are_timed_exist(every):
     stages = importlib.import_module("where_time_goes").STAGES
     sys.modules.pop("where_time_goes")
     for _, module, path in stages:

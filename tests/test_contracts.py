@@ -172,15 +172,7 @@ def built(plain, scene):
 
 def test_there_is_something_to_test():
     groups = {group for group, _ in OPTIONS}
-    assert groups == {
-        *KINDS,
-        "trainer",
-        "callbacks",
-        "logger",
-        "recipe",
-        "sweep",
-        "experiment",
-    }
+    assert groups == {*KINDS, "trainer", "callbacks", "logger", "recipe", "sweep", "experiment"}
 
 
 def test_every_option_is_composed():

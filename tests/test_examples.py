@@ -38,7 +38,7 @@ def check_outputs(folder: Path) -> None:
     assert len(json.loads((written / "web" / "export.json").read_text())["times"]) == 8
 
 
-def test_the_script_runs(settings: None, tmp_path: Path) -> None:
+def test_the_script_runs(settings, tmp_path):
     text = (EXAMPLES / "first_minute.py").read_text(encoding="utf-8")
     for long, short in (('"320"', '"64"'), ('"--times", "8"', '"--times", "8", *COARSE')):
         assert text.count(long) == 1
@@ -52,7 +52,7 @@ def test_the_script_runs(settings: None, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_notebook_runs(settings: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_notebook_runs(settings, tmp_path, monkeypatch):
     """Its cells are those of the script, which tests/test_docs.py checks."""
     # Another process, whose scenes have videos of their usual length.
     own = shlex.join([*SHORT, f"data.root={tmp_path / 'scenes'}"])

@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Iterator
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 import torch
@@ -331,7 +330,7 @@ def test_a_sweep_says_how_long_it_takes_and_its_jobs_go_on(scenes, tmp_path):
     not find_spec("submitit") or not find_spec("hydra_plugins.hydra_submitit_launcher"),
     reason="jobs of a cluster need the extra sweep",
 )
-def test_a_job_of_a_cluster_that_was_killed_goes_on(tmp_path: Path) -> None:
+def test_a_job_of_a_cluster_that_was_killed_goes_on(tmp_path):
     folder, root = tmp_path / "sweep", f"data.root={tmp_path / 'scenes'}"
     launcher = ["hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=1"]
     words = ["-m", *launcher, f"hydra.sweep.dir={folder}", "resume=auto", root]

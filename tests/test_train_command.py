@@ -55,7 +55,7 @@ REFUSED = (
 )
 
 
-def test_settings_are_checked_before_the_run_directory_is_made(tmp_path: Path, monkeypatch) -> None:
+def test_settings_are_checked_before_the_run_directory_is_made(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for override in REFUSED:
         with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -69,7 +69,7 @@ def test_settings_are_checked_before_the_run_directory_is_made(tmp_path: Path, m
     assert not list(tmp_path.iterdir())
 
 
-def test_missing_scene_says_where_to_get_one(tmp_path: Path) -> None:
+def test_missing_scene_says_where_to_get_one(tmp_path):
     folder = f"hydra.run.dir={tmp_path / 'run'}"
     result = inside.train(
         "data=dnerf", f"data.root={tmp_path}", "data.scene=nothing", folder, code=1
@@ -78,12 +78,12 @@ def test_missing_scene_says_where_to_get_one(tmp_path: Path) -> None:
     assert "data=demo" in result.stderr
 
 
-def test_devices_in_a_sweep_are_refused(tmp_path: Path) -> None:
+def test_devices_in_a_sweep_are_refused(tmp_path):
     result = inside.train("-m", "trainer=ddp", "seed=0,1", f"hydra.sweep.dir={tmp_path}", code=1)
     assert "one device per job" in (result.stdout + result.stderr)
 
 
-def test_sweeps_are_resumed_job_by_job() -> None:
+def test_sweeps_are_resumed_job_by_job():
     for sweep in (["-m", "sweep=fair"], ["-m"], ["--multirun"], ["hydra.mode=MULTIRUN"]):
         with pytest.raises(ConfigError, match="one run at a time"):
             prepare([*sweep, "resume=somewhere"])
@@ -92,7 +92,7 @@ def test_sweeps_are_resumed_job_by_job() -> None:
             prepare([*single, "resume=somewhere"])
 
 
-def test_auto_goes_on_with_the_newest_run_of_the_same_settings(tmp_path: Path, monkeypatch) -> None:
+def test_auto_goes_on_with_the_newest_run_of_the_same_settings(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     own = ["model.resolution=8", "data.scene=a/b"]
     assert prepare([*own, "resume=auto"]) == [*own, "resume=null"]
@@ -108,7 +108,7 @@ def test_auto_goes_on_with_the_newest_run_of_the_same_settings(tmp_path: Path, m
     assert prepare([*own, "resume=auto"])[-1] == "resume=null"
 
 
-def test_runs_in_folders_of_any_name_are_resumed(tmp_path: Path) -> None:
+def test_runs_in_folders_of_any_name_are_resumed(tmp_path):
     run = tmp_path / "my scene (1), a=b & c"
     run.mkdir()
     (run / "overrides.txt").write_text("seed=3\n")
@@ -119,7 +119,7 @@ def test_runs_in_folders_of_any_name_are_resumed(tmp_path: Path) -> None:
     assert shlex.split(resume_command(run))[-1] == f"resume={run}"
 
 
-def test_auto_finds_runs_whatever_was_said_to_hydra(tmp_path: Path, monkeypatch) -> None:
+def test_auto_finds_runs_whatever_was_said_to_hydra(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "outputs" / "run"
     run.mkdir(parents=True)
@@ -130,7 +130,7 @@ def test_auto_finds_runs_whatever_was_said_to_hydra(tmp_path: Path, monkeypatch)
     assert prepare([own[0], own[2], "resume=auto"])[-1] == "resume=null"
 
 
-def test_a_sweep_does_not_take_other_jobs_for_its_own(tmp_path: Path) -> None:
+def test_a_sweep_does_not_take_other_jobs_for_its_own(tmp_path):
     (tmp_path / "overrides.txt").write_text("model.plane_lr=0.002\ntrainer.max_steps=9\n")
     for same in (
         ["model.plane_lr=0.002", "resume=auto"],
@@ -142,7 +142,7 @@ def test_a_sweep_does_not_take_other_jobs_for_its_own(tmp_path: Path) -> None:
             launch._require_same_job(tmp_path, other)
 
 
-def test_what_hydra_knows_may_stand_in_settings(scenes: Path, tmp_path: Path) -> None:
+def test_what_hydra_knows_may_stand_in_settings(scenes, tmp_path):
     (tmp_path / "link").symlink_to(scenes)
     result = inside.train(
         *(option for option in SMALL if not option.startswith("trainer.max_steps")),
@@ -156,13 +156,13 @@ def test_what_hydra_knows_may_stand_in_settings(scenes: Path, tmp_path: Path) ->
     assert "psnr" in result.stdout
 
 
-def test_a_group_set_to_null_is_answered_with_its_choices() -> None:
+def test_a_group_set_to_null_is_answered_with_its_choices():
     for group, choice in (("logger", "none"), ("lrm", "tiny"), ("callbacks", "default")):
         with pytest.raises(ConfigError, match=rf"{group}=null: must be one of .*{choice}"):
             prepare([f"{group}=null"])
 
 
-def test_a_run_goes_on_from_another_directory(scenes: Path, tmp_path: Path) -> None:
+def test_a_run_goes_on_from_another_directory(scenes, tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     (tmp_path / "a" / "scenes").symlink_to(scenes)
@@ -175,7 +175,7 @@ def test_a_run_goes_on_from_another_directory(scenes: Path, tmp_path: Path) -> N
     assert not list((tmp_path / "b").iterdir())
 
 
-def test_a_stopped_sweep_says_how_the_whole_of_it_goes_on(tmp_path, monkeypatch, capsys) -> None:
+def test_a_stopped_sweep_says_how_the_whole_of_it_goes_on(tmp_path, monkeypatch, capsys):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         chosen = ["hydra.mode=MULTIRUN", f"hydra.sweep.dir={tmp_path}", "hydra.job.num=0"]
         chosen += [f"hydra.runtime.output_dir={tmp_path}", "hydra.job.id=0"]
@@ -205,7 +205,7 @@ def test_a_stopped_sweep_says_how_the_whole_of_it_goes_on(tmp_path, monkeypatch,
         (".5", ".5"),
     ],
 )
-def test_run_directories_have_names_that_need_no_quotes(scene: str, name: str) -> None:
+def test_run_directories_have_names_that_need_no_quotes(scene, name):
     assert file_name(scene) == name
     with initialize_config_dir(str(CONF), version_base="1.3"):
         overrides = [f"data.scene={quoted(scene)}", "hydra.job.num=3"]
@@ -214,7 +214,7 @@ def test_run_directories_have_names_that_need_no_quotes(scene: str, name: str) -
     assert config.hydra.sweep.subdir == f"3_{name}_six_planes_tiny_s0"
 
 
-def test_names_of_scenes_may_look_like_numbers() -> None:
+def test_names_of_scenes_may_look_like_numbers():
     for name in ("2024_05_01", "1e3", "007", "1.0", "12"):
         with initialize_config_dir(str(CONF), version_base="1.3"):
             config = compose("train", prepare([f"data.scene={name}", f"data.root={name}"]))
@@ -233,7 +233,7 @@ HARD = (
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_any_path_can_be_given(name: str, tmp_path: Path, monkeypatch) -> None:
+def test_any_path_can_be_given(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     keys = ("data.root", "data.cache", "resume", "hydra.run.dir")
     given = [f"{key}={name}" for key in keys if key != "resume"]
@@ -245,13 +245,13 @@ def test_any_path_can_be_given(name: str, tmp_path: Path, monkeypatch) -> None:
     assert unquoted(quoted(name)) == name
 
 
-def test_quotes_keep_any_text() -> None:
+def test_quotes_keep_any_text():
     for length in range(1, 5):
         for text in map("".join, itertools.product("\\\\'\"a ", repeat=length)):
             assert unquoted(quoted(text)) == text
 
 
-def test_home_is_expanded(monkeypatch, tmp_path: Path) -> None:
+def test_home_is_expanded(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("USERPROFILE", str(tmp_path))
     assert with_names("data.root=~/my captures") == f"data.root='{tmp_path}/my captures'"
@@ -267,7 +267,7 @@ def test_home_is_expanded(monkeypatch, tmp_path: Path) -> None:
     assert (settings.masks, settings.times) == (f"{tmp_path}/m", f"{tmp_path}/t.csv")
 
 
-def test_piped_output_is_plain_and_ends_with_scores_and_paths(root: str, tmp_path: Path) -> None:
+def test_piped_output_is_plain_and_ends_with_scores_and_paths(root, tmp_path):
     run = tmp_path / "run"
     result = inside.train(root, *SMALL, "trainer.max_steps=5", f"hydra.run.dir={run}")
     assert "\x1b" not in result.stdout
@@ -381,7 +381,7 @@ def start(run: Path, root: str) -> warm.Running:
     )
 
 
-def test_a_run_is_alone_in_its_folder_and_ctrl_c_saves_it(root: str, tmp_path: Path) -> None:
+def test_a_run_is_alone_in_its_folder_and_ctrl_c_saves_it(root, tmp_path):
     run = tmp_path / "run"
     process = start(run, root)
     warm.wait_for(run / "checkpoints" / "last.ckpt", process)
@@ -394,7 +394,7 @@ def test_a_run_is_alone_in_its_folder_and_ctrl_c_saves_it(root: str, tmp_path: P
         assert (run / ".lock").is_file()
 
 
-def test_turns_are_free_when_nobody_holds_them(tmp_path: Path) -> None:
+def test_turns_are_free_when_nobody_holds_them(tmp_path):
     with in_turn(tmp_path / "a.lock") as waited:
         assert not waited
     with in_turn(None) as waited:
@@ -402,7 +402,7 @@ def test_turns_are_free_when_nobody_holds_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_killed_and_resumed_run_ends_with_the_same_numbers(root: str, tmp_path: Path) -> None:
+def test_killed_and_resumed_run_ends_with_the_same_numbers(root, tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert start(whole, root).wait(240) == 0
     process = start(killed, root)
@@ -415,7 +415,7 @@ def test_killed_and_resumed_run_ends_with_the_same_numbers(root: str, tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_resumed_run_finds_groups_of_the_users_own_again(root: str, tmp_path: Path) -> None:
+def test_a_resumed_run_finds_groups_of_the_users_own_again(root, tmp_path):
     conf, run = tmp_path / "conf", tmp_path / "run"
     (conf / "model").mkdir(parents=True)
     (conf / "model" / "own.yaml").write_text("defaults: [six_planes]\nname: own\n")
@@ -431,7 +431,7 @@ def test_a_resumed_run_finds_groups_of_the_users_own_again(root: str, tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_field_renders_the_scene_inside_a_job(root: str, tmp_path: Path) -> None:
+def test_a_field_renders_the_scene_inside_a_job(root, tmp_path):
     # That field's own settings are composed while Hydra's job is under way.
     folder = tmp_path / "run"
     result = train(

@@ -13,11 +13,7 @@ from tests.baselines.runs import baseline_config
 from tests.baselines.test_gaussians import FRAME, control, stepped
 from xplanes.baselines.gaussians import points
 from xplanes.baselines.gaussians.densification import densify
-from xplanes.baselines.gaussians.field import (
-    DeformedGaussians,
-    PointCloud,
-    SpacetimeGaussians,
-)
+from xplanes.baselines.gaussians.field import DeformedGaussians, PointCloud, SpacetimeGaussians
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.metrics import ssim
@@ -236,19 +232,10 @@ def test_what_cannot_begin_with_points_or_planes_is_refused(scenes):
             ("model=six_planes", "lrm=field"),
             r"lrm=field with model=six_planes: the initialisation is points",
         ),
-        (
-            ("model=kplanes", "lrm=field"),
-            "is points, and the model takes none; set lrm=none",
-        ),
-        (
-            ("model=gaussians_deform", "lrm=tiny"),
-            "is planes, and the model takes points",
-        ),
+        (("model=kplanes", "lrm=field"), "is points, and the model takes none; set lrm=none"),
+        (("model=gaussians_deform", "lrm=tiny"), "is planes, and the model takes points"),
         (("model=gaussians_deform", "lrm=field", "lrm.source=field"), r"source=field: must be one"),
-        (
-            ("model=gaussians_deform", "model.final_network_lr=0"),
-            r"final_network_lr=0\.0:",
-        ),
+        (("model=gaussians_deform", "model.final_network_lr=0"), r"final_network_lr=0\.0:"),
         (("model=gaussians_spacetime", "model.precision=bf16"), r"precision=bf16: Gaussians"),
     ):
         with pytest.raises(ConfigError, match=words):

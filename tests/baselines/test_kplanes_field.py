@@ -9,11 +9,7 @@ import torch
 from tests.baselines.oracles import product_features
 from xplanes.baselines.kplanes.field import DensityField, ExplicitDecoder, HybridDecoder, KPlanes
 from xplanes.baselines.networks import PaddedMLP, spherical_harmonics, truncated_exponential
-from xplanes.baselines.products import (
-    PlaneProducts,
-    plane_product,
-    plane_product_reference,
-)
+from xplanes.baselines.products import PlaneProducts, plane_product, plane_product_reference
 
 
 def products(time=3, channels=2, scales=(1, 2)):

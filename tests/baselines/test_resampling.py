@@ -7,12 +7,7 @@ import pytest
 import torch
 
 from tests.baselines import oracles
-from xplanes.baselines.proposal import (
-    Level,
-    ProposalRenderer,
-    dense_samples,
-    histogram_loss,
-)
+from xplanes.baselines.proposal import Level, ProposalRenderer, dense_samples, histogram_loss
 from xplanes.baselines.resampling import covering_weights, ray_weights, resample, uniform_edges
 from xplanes.rendering.compositing import composite_reference
 

@@ -24,14 +24,8 @@ def mlp(decoder, features, activation):
     return hidden
 
 
-ACTIVATIONS = {
-    "relu": lambda x: np.maximum(x, 0),
-    "silu": lambda x: x / (1 + np.exp(-x)),
-}
-DENSITIES = {
-    "softplus": lambda x: np.log1p(np.exp(x - 1)),
-    "exp": lambda x: np.exp(x - 1),
-}
+ACTIVATIONS = {"relu": lambda x: np.maximum(x, 0), "silu": lambda x: x / (1 + np.exp(-x))}
+DENSITIES = {"softplus": lambda x: np.log1p(np.exp(x - 1)), "exp": lambda x: np.exp(x - 1)}
 
 
 def test_output_is_the_formula_of_the_public_models():

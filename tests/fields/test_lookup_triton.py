@@ -43,12 +43,7 @@ def compare(found, tolerance, case):
     for a, b in zip(ours, theirs, strict=True):
         assert b.numel() == 0 or b.abs().max() > 0.1, case
         torch.testing.assert_close(
-            a,
-            b,
-            atol=tolerance,
-            rtol=tolerance,
-            check_dtype=False,
-            msg=lambda m: f"{case}: {m}",
+            a, b, atol=tolerance, rtol=tolerance, check_dtype=False, msg=lambda m: f"{case}: {m}"
         )
 
 

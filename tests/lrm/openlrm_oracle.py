@@ -20,11 +20,7 @@ def window_rays(cameras, anchors, resolutions, size):
     down = (v - matrix[:, 1, 2, None]) / matrix[:, 1, 1, None]
     shape = (len(cameras), size, size)
     local = torch.stack(
-        [
-            right[:, None, :].expand(shape),
-            -down[:, :, None].expand(shape),
-            -torch.ones(shape),
-        ],
+        [right[:, None, :].expand(shape), -down[:, :, None].expand(shape), -torch.ones(shape)],
         dim=-1,
     ).flatten(1, 2)
     directions = F.normalize(torch.einsum("bij,bqj->bqi", pose[:, :3, :3], local), dim=-1)

@@ -50,12 +50,7 @@ CONFIGS = {
             "cross_attention_dim": 24,
         },
         "post_processor": {"in_channels": 64, "out_channels": 6},
-        "decoder": {
-            "in_channels": 18,
-            "n_neurons": 16,
-            "n_hidden_layers": 3,
-            "activation": "silu",
-        },
+        "decoder": {"in_channels": 18, "n_neurons": 16, "n_hidden_layers": 3, "activation": "silu"},
         "renderer": {"radius": 0.87, "density_activation": "exp", "density_bias": -1.0},
         "_reduced_encoder": DINO,
     },

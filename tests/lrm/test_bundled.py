@@ -27,7 +27,7 @@ def ship(folder: Path, name: str, seed: int = 0) -> Path:
     return path
 
 
-def test_a_model_is_loaded_from_half_precision(tmp_path: Path):
+def test_a_model_is_loaded_from_half_precision(tmp_path):
     path = ship(tmp_path, "tiny")
     assert bundled_models(tmp_path) == ["tiny"]
     model, found = load_bundled("tiny", tmp_path)
@@ -38,7 +38,7 @@ def test_a_model_is_loaded_from_half_precision(tmp_path: Path):
     assert model.encode(torch.rand(1, 3, 56, 56)).isfinite().all()
 
 
-def test_changed_weights_are_refused(tmp_path: Path):
+def test_changed_weights_are_refused(tmp_path):
     path = ship(tmp_path, "tiny")
     content = bytearray(path.read_bytes())
     content[-5] ^= 1
@@ -50,7 +50,7 @@ def test_changed_weights_are_refused(tmp_path: Path):
         load_bundled("tiny", tmp_path)
 
 
-def test_swapped_weights_are_refused(tmp_path: Path):
+def test_swapped_weights_are_refused(tmp_path):
     tiny, mini = ship(tmp_path, "tiny"), ship(tmp_path, "mini", seed=1)
     content = tiny.read_bytes()
     tiny.write_bytes(mini.read_bytes())
@@ -60,7 +60,7 @@ def test_swapped_weights_are_refused(tmp_path: Path):
             load_bundled(name, tmp_path)
 
 
-def test_a_model_that_is_not_there_is_named_with_those_that_are(tmp_path: Path):
+def test_a_model_that_is_not_there_is_named_with_those_that_are(tmp_path):
     ship(tmp_path, "tiny")
     with pytest.raises(LRMError, match=r"huge\.safetensors.*no such model.*contains tiny"):
         load_bundled("huge", tmp_path)
@@ -69,7 +69,7 @@ def test_a_model_that_is_not_there_is_named_with_those_that_are(tmp_path: Path):
         load_bundled("tiny", tmp_path)
 
 
-def test_the_file_that_is_named_is_the_one_that_is_read(tmp_path: Path):
+def test_the_file_that_is_named_is_the_one_that_is_read(tmp_path):
     path = ship(tmp_path, "own")
 
     def settings(weights: Path) -> BundledLRMSettings:

@@ -99,11 +99,7 @@ def test_configurations_and_names_of_no_known_model_are_refused():
     assert len({published.choice for published in PUBLISHED.values()}) == len(PUBLISHED)
 
 
-EPSILONS = {
-    "openlrm-1.0": {1e-12, 1e-6},
-    "openlrm-1.1": {1e-6},
-    "triposr": {1e-12, 1e-5},
-}
+EPSILONS = {"openlrm-1.0": {1e-12, 1e-6}, "openlrm-1.1": {1e-6}, "triposr": {1e-12, 1e-5}}
 
 
 def test_norm_epsilons():

@@ -14,13 +14,7 @@ from tests.local_server import serving
 from tests.lrm.reduced import published_shapes, reduced
 from xplanes.lrm import LRMError
 from xplanes.lrm.config import parse_config, published_config
-from xplanes.lrm.weights import (
-    WeightSource,
-    answers,
-    find_weights,
-    load_weights,
-    read_config,
-)
+from xplanes.lrm.weights import WeightSource, answers, find_weights, load_weights, read_config
 
 SOURCE = WeightSource(
     architecture="openlrm-small-1.1",

@@ -37,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_stage_is_computed_once_and_loaded_unchanged(folder: Path):
+def test_a_stage_is_computed_once_and_loaded_unchanged(folder):
     make = Maker()
     stage = StageCache(folder).stage("parts", INPUTS, make)
     assert (make.calls, stage.cached) == (0, True)
@@ -46,7 +46,7 @@ def test_a_stage_is_computed_once_and_loaded_unchanged(folder: Path):
     assert stage.content["report"] == fresh["report"]
 
 
-def test_compiling_is_no_part_of_a_stages_time(folder: Path, monkeypatch):
+def test_compiling_is_no_part_of_a_stages_time(folder, monkeypatch):
     def make():
         with warm_up.timed():
             return {}
@@ -57,7 +57,7 @@ def test_compiling_is_no_part_of_a_stages_time(folder: Path, monkeypatch):
     assert warm_up.seconds - before == pytest.approx(30)
 
 
-def test_other_inputs_or_another_name_are_another_stage(folder: Path):
+def test_other_inputs_or_another_name_are_another_stage(folder):
     for name, inputs in (
         ("parts", [torch.arange(6.0) + 1e-7, INPUTS[1]]),
         ("parts", [torch.arange(6.0).double(), INPUTS[1]]),
@@ -100,7 +100,7 @@ def damaged(path: Path, kind: str) -> None:
 DAMAGES = "truncated empty flipped foreign version report key checksum content seconds".split()
 
 
-def test_damaged_entries_are_reported_and_recomputed(tmp_path: Path, caplog):
+def test_damaged_entries_are_reported_and_recomputed(tmp_path, caplog):
     for kind in DAMAGES:
         folder = tmp_path / kind
         StageCache(folder).stage("parts", INPUTS, Maker())
@@ -115,12 +115,12 @@ def test_damaged_entries_are_reported_and_recomputed(tmp_path: Path, caplog):
         assert StageCache(folder).stage("parts", INPUTS, Maker()).cached, kind
 
 
-def test_a_new_version_of_the_code_recomputes(folder: Path, monkeypatch):
+def test_a_new_version_of_the_code_recomputes(folder, monkeypatch):
     monkeypatch.setattr(cache_module, "VERSION", cache_module.VERSION + 1)
     assert not StageCache(folder).stage("parts", INPUTS, Maker()).cached
 
 
-def test_a_disabled_cache_stores_nothing(tmp_path: Path):
+def test_a_disabled_cache_stores_nothing(tmp_path):
     make = Maker()
     for _ in range(2):
         StageCache(None).stage("parts", INPUTS, make)
@@ -129,7 +129,7 @@ def test_a_disabled_cache_stores_nothing(tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_cannot_be_written_disables_the_cache_only(tmp_path: Path, caplog):
+def test_a_folder_that_cannot_be_written_disables_the_cache_only(tmp_path, caplog):
     (tmp_path / "file").write_text("")
     with caplog.at_level(logging.WARNING):
         stage = StageCache(tmp_path / "file").stage("parts", INPUTS, Maker())
@@ -137,7 +137,7 @@ def test_a_folder_that_cannot_be_written_disables_the_cache_only(tmp_path: Path,
     assert "cannot be written: stages are not cached" in caplog.text
 
 
-def test_an_entry_that_cannot_be_written_is_not_cached(tmp_path: Path, caplog, monkeypatch):
+def test_an_entry_that_cannot_be_written_is_not_cached(tmp_path, caplog, monkeypatch):
     def refuse(*_args) -> None:
         raise OSError(28, "No space left on device")
 
@@ -148,7 +148,7 @@ def test_an_entry_that_cannot_be_written_is_not_cached(tmp_path: Path, caplog, m
     assert not list(tmp_path.iterdir())
 
 
-def test_files_are_no_code(tmp_path: Path):
+def test_files_are_no_code(tmp_path):
     class Evil:
         def __reduce__(self):
             return (Path.touch, (tmp_path / "executed",))
@@ -172,9 +172,7 @@ def test_fingerprints_do_not_depend_on_layout():
     assert fingerprint(tensor.bfloat16()) == fingerprint(tensor.bfloat16().clone())
 
 
-def test_a_folder_that_takes_no_files_is_read_and_not_written(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog
-):
+def test_a_folder_that_takes_no_files_is_read_and_not_written(folder, monkeypatch, caplog):
     def refuse(place: Path) -> None:
         raise StorageError(f"{place} cannot be written: Read-only file system")
 

@@ -64,7 +64,7 @@ def video_of(method, scene, folder, size=24):
     return made, said
 
 
-def test_the_field_that_renders_has_its_models_default_settings(tmp_path: Path):
+def test_the_field_that_renders_has_its_models_default_settings(tmp_path):
     changed = ("model=nine_planes", "model.sampler.samples=16", "model.precision=bf16")
     rendering = rendering_method(
         settings(tmp_path, *changed, "seed=3"), ball_views(6, 0.6), CubeHints(0.9)
@@ -89,7 +89,7 @@ def test_all_timesteps_are_rendered_and_steps_alone_may_limit_training(tmp_path,
     assert made.description == "7 frames rendered by six_planes trained for 60 steps"
 
 
-def test_it_leaves_the_run_as_deterministic_as_it_was(tmp_path: Path, small_fields):
+def test_it_leaves_the_run_as_deterministic_as_it_was(tmp_path, small_fields):
     method = settings(tmp_path, "preparation.fixed_view_steps=1")
     before = torch.are_deterministic_algorithms_enabled()
     try:
@@ -101,7 +101,7 @@ def test_it_leaves_the_run_as_deterministic_as_it_was(tmp_path: Path, small_fiel
         torch.use_deterministic_algorithms(before)
 
 
-def test_kplanes_render_as_published(tmp_path: Path):
+def test_kplanes_render_as_published(tmp_path):
     own = settings(tmp_path, "preparation.fixed_view_model=kplanes")
     published = default_settings("model=kplanes").model
     found = rendering_method(own, ball_views(6, 0.6)).model
@@ -129,7 +129,7 @@ PLACES = {
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_published_bounds_give_way_where_they_do_not_fit(tmp_path: Path, place):
+def test_published_bounds_give_way_where_they_do_not_fit(tmp_path, place):
     moved, half_side = PLACES[place]
     hints = CubeHints(half_side)
     views = elsewhere(**moved)
@@ -165,7 +165,7 @@ def test_a_field_that_breaks_names_settings_that_the_user_has(tmp_path, small_fi
     assert "plane_lr" not in str(caught.value)
 
 
-def test_a_model_that_is_not_there_cannot_render(tmp_path: Path):
+def test_a_model_that_is_not_there_cannot_render(tmp_path):
     with pytest.raises(ConfigError, match=r"^preparation\.fixed_view_model=nerf: .* kplanes, "):
         settings(tmp_path, "preparation.fixed_view_model=nerf")
 
@@ -209,7 +209,7 @@ class KnownField(RayRenderer):
         return {"colour": hit[:, None] * colour, "opacity": hit.float()}
 
 
-def test_the_video_shows_what_the_field_holds_from_the_models_camera(tmp_path: Path, monkeypatch):
+def test_the_video_shows_what_the_field_holds_from_the_models_camera(tmp_path, monkeypatch):
     """In K-Planes' own cube, with rays that begin as far away as in training."""
     scene, centre, fields = ball_scene(count=12, size=24), swinging(0.3, 0.5), []
 
@@ -242,7 +242,7 @@ def test_the_video_shows_what_the_field_holds_from_the_models_camera(tmp_path: P
     torch.testing.assert_close((middle - frame.centre).norm(), away, rtol=1e-3, atol=0)
 
 
-def test_kplanes_render(tmp_path: Path, small_fields):
+def test_kplanes_render(tmp_path, small_fields):
     options = ("preparation.fixed_view_model=kplanes", "preparation.fixed_view_steps=10")
     made, said = video_of(settings(tmp_path, *options), ball_scene(), tmp_path / "cache", size=12)
     assert "training kplanes for" in said[0]
@@ -261,7 +261,7 @@ def test_frames_are_picked_evenly():
     assert picked.times.tolist() == [0, 0, 0.5, 0.5, 0.5, 1, 1]
 
 
-def test_a_scene_of_one_timestep_uses_the_frame_of_that_timestep(tmp_path: Path):
+def test_a_scene_of_one_timestep_uses_the_frame_of_that_timestep(tmp_path):
     static = ball_scene(moving=False)
     views = static.splits["train"]
     views = replace(views, times=torch.full_like(views.times, 0.5))
@@ -314,7 +314,7 @@ def test_without_an_azimuth_the_axis_nearest_to_a_camera_of_that_height_is_taken
     torch.testing.assert_close(flat, nearest, atol=1e-4, rtol=0)
 
 
-def test_the_scenes_video_costs_nothing(tmp_path: Path):
+def test_the_scenes_video_costs_nothing(tmp_path):
     scene = replace(ball_scene(), video=ball_views(9, 0.6))
     made, said = video_of(settings(tmp_path), scene, tmp_path / "cache")
     assert made.seconds == 0
@@ -323,14 +323,12 @@ def test_the_scenes_video_costs_nothing(tmp_path: Path):
     assert not (tmp_path / "cache").exists()
 
 
-def test_a_video_that_is_not_there_is_refused(tmp_path: Path):
+def test_a_video_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(SceneError, match=r"preparation\.fixed_view=video: ball has no video"):
         video_of(settings(tmp_path, "preparation.fixed_view=video"), ball_scene(), tmp_path)
 
 
-def test_a_field_renders_the_scene_and_the_video_is_cached(
-    tmp_path: Path, small_fields, monkeypatch
-):
+def test_a_field_renders_the_scene_and_the_video_is_cached(tmp_path, small_fields, monkeypatch):
     scene, cache = ball_scene(count=12, size=24), tmp_path / "cache"
     made, said = video_of(settings(tmp_path), scene, cache)
     assert len(said) == 1
@@ -350,7 +348,7 @@ def test_a_field_renders_the_scene_and_the_video_is_cached(
     assert torch.equal(again.views.images, made.views.images)
 
 
-def test_an_interrupted_field_is_resumed(tmp_path: Path, small_fields, monkeypatch):
+def test_an_interrupted_field_is_resumed(tmp_path, small_fields, monkeypatch):
     scene, cache = ball_scene(count=12, size=24), tmp_path / "cache"
     method = settings(tmp_path, "preparation.fixed_view_steps=10")
 
@@ -380,7 +378,7 @@ def walled(views, *, alpha=255):
     return replace(views, images=images)
 
 
-def test_a_video_of_the_world_around_the_thing_is_not_the_lrms(tmp_path: Path, monkeypatch):
+def test_a_video_of_the_world_around_the_thing_is_not_the_lrms(tmp_path, monkeypatch):
     rendered = object()
     monkeypatch.setattr(module, "_rendered", lambda *_: rendered)
     bare = ball_scene()
@@ -399,7 +397,7 @@ def test_a_video_of_the_world_around_the_thing_is_not_the_lrms(tmp_path: Path, m
     assert bool((asked.views.in_memory()[..., 3] == 255).all())
 
 
-def test_masks_beside_opaque_images_cut_the_thing_out(tmp_path: Path, monkeypatch):
+def test_masks_beside_opaque_images_cut_the_thing_out(tmp_path, monkeypatch):
     bare = ball_scene(size=24)
     whole = {split: walled(views) for split, views in bare.splits.items()}
     scene = Scene("ball", whole, lrm_views=bare.splits["train"])
@@ -417,7 +415,7 @@ def test_masks_beside_opaque_images_cut_the_thing_out(tmp_path: Path, monkeypatc
     assert not any("no silhouettes" in words for words in said)
 
 
-def test_the_video_of_a_field_in_a_world_shows_the_cube_alone(tmp_path: Path):
+def test_the_video_of_a_field_in_a_world_shows_the_cube_alone(tmp_path):
     bare = ball_scene(size=24)
     scene = replace(bare, splits={split: walled(v) for split, v in bare.splits.items()})
     method = settings(tmp_path, "preparation.fixed_view_steps=3")

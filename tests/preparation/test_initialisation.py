@@ -48,11 +48,7 @@ def built(method: Method, *, moving: bool = True, devices: int = 1) -> RadianceM
 
 
 def initialised(
-    folder: Path,
-    sequence: TriplaneSequence,
-    *overrides: str,
-    moving: bool = True,
-    devices: int = 1,
+    folder: Path, sequence: TriplaneSequence, *overrides: str, moving: bool = True, devices: int = 1
 ) -> tuple[Initialisation, RadianceModule]:
     """An initialisation from a file, and the field that it builds."""
     path = folder / "triplanes.pt"
@@ -72,7 +68,7 @@ def finished(tmp_path_factory) -> tuple[Path, Initialisation, RadianceModule]:
     return folder, *initialised(folder, SEQUENCE)
 
 
-def test_no_source_is_a_random_initialisation_that_touches_nothing(tmp_path: Path):
+def test_no_source_is_a_random_initialisation_that_touches_nothing(tmp_path):
     method = Method.read(small_config(tmp_path, f"preparation.cache={tmp_path}/cache"))
     assert method.lrm.load() is None
     module = built(method)
@@ -109,7 +105,7 @@ def test_a_rank_one_initialisation_explains_what_moves(finished):
         assert again == pytest.approx(unexplained["after"], rel=1e-5), case
 
 
-def test_the_initial_field_shows_the_static_part_where_nothing_moves(tmp_path: Path):
+def test_the_initial_field_shows_the_static_part_where_nothing_moves(tmp_path):
     # With few frames the automatic weight takes peaks of static content for motion.
     sequence = TriplaneSequence(moving_sequence(frames=40))
     found, module = initialised(tmp_path, sequence, "model.resolution=16")
@@ -161,7 +157,7 @@ def test_a_second_initialisation_comes_from_the_cache(finished, monkeypatch):
         initialised(folder, SEQUENCE, "decomposition.tolerance=0.001")
 
 
-def test_the_cache_can_be_switched_off(tmp_path: Path, monkeypatch):
+def test_the_cache_can_be_switched_off(tmp_path, monkeypatch):
     calls = []
     original = stages_module.decompose
     monkeypatch.setattr(
@@ -174,7 +170,7 @@ def test_the_cache_can_be_switched_off(tmp_path: Path, monkeypatch):
         assert len(calls) == 2 * count, override
 
 
-def test_channels_decoder_and_frame_of_the_file_prevail(tmp_path: Path):
+def test_channels_decoder_and_frame_of_the_file_prevail(tmp_path):
     decoder = Decoder(4, **OPTIONS)
     frame = Frame(0.5, torch.eye(3), torch.tensor([0.1, 0.2, 0.3]))
     sequence = TriplaneSequence(
@@ -190,14 +186,14 @@ def test_channels_decoder_and_frame_of_the_file_prevail(tmp_path: Path):
         assert torch.equal(ours, theirs)
 
 
-def test_options_that_no_decoder_has_are_refused(tmp_path: Path):
+def test_options_that_no_decoder_has_are_refused(tmp_path):
     options = OPTIONS | {"activation": "sine"}
     decoder = Decoder(8, **OPTIONS).state_dict()
     with pytest.raises(ConfigError, match=r"triplanes\.pt: decoder_config\.activation=sine"):
         initialised(tmp_path, TriplaneSequence(SEQUENCE.triplanes, decoder, options))
 
 
-def test_a_scene_of_one_timestep_uses_the_low_rank_part_only(tmp_path: Path):
+def test_a_scene_of_one_timestep_uses_the_low_rank_part_only(tmp_path):
     found, module = initialised(tmp_path, SEQUENCE, moving=False)
     assert set(found.values.planes) == {"xy", "xz", "yz"}
     assert module.field.time is None
@@ -206,7 +202,7 @@ def test_a_scene_of_one_timestep_uses_the_low_rank_part_only(tmp_path: Path):
     assert set(found.report) == {"xy", "xz", "yz"}
 
 
-def test_one_triplane_is_the_space_planes(tmp_path: Path, caplog):
+def test_one_triplane_is_the_space_planes(tmp_path, caplog):
     sequence = TriplaneSequence(moving_sequence(frames=1))
     for moving in (True, False):
         caplog.clear()
@@ -234,7 +230,7 @@ def test_no_weight_needs_no_sparse_part(finished):
     assert module.field.time is not None
 
 
-def test_a_source_that_is_not_there_is_refused_first(tmp_path: Path):
+def test_a_source_that_is_not_there_is_refused_first(tmp_path):
     for overrides, words in (
         ((), "lrm=file needs lrm.triplanes=FILE"),
         (("lrm.triplanes=nowhere.pt",), "lrm.triplanes=nowhere.pt: there is no such file"),
@@ -243,7 +239,7 @@ def test_a_source_that_is_not_there_is_refused_first(tmp_path: Path):
         assert_refused(ConfigError, words, lrm.load, overrides)
 
 
-def test_processes_share_an_initialisation_through_a_folder_that_takes_files(tmp_path: Path):
+def test_processes_share_an_initialisation_through_a_folder_that_takes_files(tmp_path):
     (tmp_path / "file").write_text("")
     for cache, words in (
         (tmp_path / "file" / "cache", r"cannot be written, and the 2 processes share"),
@@ -255,9 +251,7 @@ def test_processes_share_an_initialisation_through_a_folder_that_takes_files(tmp
     initialised(tmp_path, SEQUENCE, devices=2)
 
 
-def test_the_video_of_a_run_shows_the_field_in_its_own_frame(
-    scenes: Path, tmp_path: Path, monkeypatch
-):
+def test_the_video_of_a_run_shows_the_field_in_its_own_frame(scenes, tmp_path, monkeypatch):
     frame = Frame(0.4, torch.eye(3), torch.tensor([0.1, 0.2, 0.3]))
     save_triplanes(tmp_path / "a.pt", TriplaneSequence(moving_sequence(), frame=frame))
     shown, original = [], render.render_path

@@ -134,12 +134,12 @@ def check_field_of_model(folder: Path, name: str, matching: str) -> None:
         assert model.decoder.density_scale == pytest.approx(1 / CHORD)
 
 
-def test_the_field_is_the_models_at_its_place_in_the_world(tmp_path: Path):
+def test_the_field_is_the_models_at_its_place_in_the_world(tmp_path):
     for name, matching in product(SIDES, ("scale", "pad")):
         check_field_of_model(tmp_path / matching, name, matching)
 
 
-def test_the_cube_holds_all_that_the_views_show(tmp_path: Path):
+def test_the_cube_holds_all_that_the_views_show(tmp_path):
     scene = video_scene()
     for name in SIDES:
         made, _, frame = made_of(settings(tmp_path, name), scene)
@@ -147,7 +147,7 @@ def test_the_cube_holds_all_that_the_views_show(tmp_path: Path):
         assert made.sequence.frame.points(ball).abs().max() <= 1 + 1e-4, name
 
 
-def test_the_report_is_whole(tmp_path: Path):
+def test_the_report_is_whole(tmp_path):
     made, lrm, _ = made_of(settings(tmp_path, "openlrm-1.1"), video_scene())
     assert made.report["frames"] == made.report["distinct"] == 3
     assert made.report["cached"] == 0
@@ -160,7 +160,7 @@ def test_the_report_is_whole(tmp_path: Path):
     assert made.picture.std() > 0.01
 
 
-def test_one_crop_holds_the_object_at_all_times(tmp_path: Path):
+def test_one_crop_holds_the_object_at_all_times(tmp_path):
     frames = video_scene(size=48).video.images
     crop = picture_crop(frames, crop=True)
     tight = (frames[..., 3].amax(dim=0) > 0).nonzero()
@@ -176,7 +176,7 @@ def test_one_crop_holds_the_object_at_all_times(tmp_path: Path):
         picture_crop(torch.zeros_like(frames), crop=True)
 
 
-def test_weights_of_another_size_are_refused_before_any_scene_is_read(tmp_path: Path):
+def test_weights_of_another_size_are_refused_before_any_scene_is_read(tmp_path):
     plain = plain_settings(tmp_path, "openlrm-1.1")
     wrong = publish(tmp_path / "wrong", "triposr")
     (tmp_path / "wrong" / "config.json").unlink()
@@ -186,12 +186,12 @@ def test_weights_of_another_size_are_refused_before_any_scene_is_read(tmp_path: 
     assert not (tmp_path / "excavator_32px_s0").exists()
 
 
-def test_missing_weights_name_the_way_out(tmp_path: Path, monkeypatch):
+def test_missing_weights_name_the_way_out(tmp_path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     with pytest.raises(LRMError, match=r"446 MB.*CC-BY-NC-4\.0.*lrm\.weights=FILE"):
         Method.read(small_config(tmp_path, "lrm=small")).lrm.load(silent)
 
 
-def test_a_batch_without_images_is_refused(tmp_path: Path):
+def test_a_batch_without_images_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"lrm\.batch=0"):
         settings(tmp_path, "openlrm-1.1", "lrm.batch=0")

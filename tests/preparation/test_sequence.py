@@ -37,7 +37,7 @@ def whole(channels: int = 4) -> TriplaneSequence:
 FILES = ("a.pt", "a.safetensors")
 
 
-def test_a_sequence_comes_back_as_it_was(tmp_path: Path):
+def test_a_sequence_comes_back_as_it_was(tmp_path):
     kinds = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
     for name, kind in product(FILES, kinds):
         case = f"{kind} in {name}"
@@ -53,14 +53,14 @@ def test_a_sequence_comes_back_as_it_was(tmp_path: Path):
         assert torch.equal(back.frame.centre, sequence.frame.centre), case
 
 
-def test_triplanes_alone_are_enough(tmp_path: Path):
+def test_triplanes_alone_are_enough(tmp_path):
     for name in FILES:
         save_triplanes(tmp_path / name, TriplaneSequence(moving_sequence()))
         back = load_triplanes(tmp_path / name)
         assert (back.decoder, back.decoder_config, back.frame) == (None, None, None), name
 
 
-def test_a_view_of_a_larger_tensor_is_written_alone(tmp_path: Path):
+def test_a_view_of_a_larger_tensor_is_written_alone(tmp_path):
     large = moving_sequence(200, 2, 8)
     save_triplanes(tmp_path / "a.pt", TriplaneSequence(large[:2]))
     assert (tmp_path / "a.pt").stat().st_size < large[:2].numel() * 4 + 4096
@@ -73,7 +73,7 @@ def refusal(path: Path) -> str:
     return str(caught.value)
 
 
-def test_missing_and_damaged_files_are_named(tmp_path: Path):
+def test_missing_and_damaged_files_are_named(tmp_path):
     assert "no such file" in refusal(tmp_path / "none.pt")
     save_triplanes(tmp_path / "a.safetensors", whole())
     content = (tmp_path / "a.safetensors").read_bytes()
@@ -146,7 +146,7 @@ WRONG = {
 }
 
 
-def test_what_cannot_be_used_is_refused_with_a_message(tmp_path: Path):
+def test_what_cannot_be_used_is_refused_with_a_message(tmp_path):
     path = tmp_path / "a.pt"
     for case, (content, words) in WRONG.items():
         torch.save(content, path)
@@ -154,13 +154,13 @@ def test_what_cannot_be_used_is_refused_with_a_message(tmp_path: Path):
         assert str(path) in said, case
 
 
-def test_what_could_not_be_loaded_is_not_written(tmp_path: Path):
+def test_what_could_not_be_loaded_is_not_written(tmp_path):
     with pytest.raises(ConfigError, match="NaN"):
         save_triplanes(tmp_path / "a.pt", TriplaneSequence(spoiled(0, float("nan"))))
     assert not list(tmp_path.iterdir())
 
 
-def test_files_are_no_code(tmp_path: Path):
+def test_files_are_no_code(tmp_path):
     class Evil:
         def __reduce__(self):
             return (Path.touch, (tmp_path / "executed",))

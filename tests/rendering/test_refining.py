@@ -178,10 +178,7 @@ def test_what_the_field_can_undo_is_removed():
     metric, known = root @ root.mT + torch.eye(6), torch.ones(6, dtype=torch.bool)
     turn, shift = torch.tensor([0.1, -0.2, 0.3]).double(), torch.tensor([1.0, 2.0, -1.0]).double()
     common = torch.cat(
-        [
-            turn.expand(6, 3),
-            torch.linalg.cross(turn.expand(6, 3), places) + shift + 0.4 * places,
-        ],
+        [turn.expand(6, 3), torch.linalg.cross(turn.expand(6, 3), places) + shift + 0.4 * places],
         dim=1,
     )
     alone = without_common(places, own, metric, known)

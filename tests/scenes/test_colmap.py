@@ -482,10 +482,7 @@ def test_settings_that_cannot_work(capture):
         (r"time_pattern=\(: is not a regular expression", {"time_pattern": "("}),
         (r"must have one group.*it has 0", {"time_pattern": "frame"}),
         (r"must have one group.*it has 2", {"time_pattern": r"(\d)(\d)"}),
-        (
-            r"not read from file names with times=rank",
-            {"time_pattern": r"(\d)", "times": "rank"},
-        ),
+        (r"not read from file names with times=rank", {"time_pattern": r"(\d)", "times": "rank"}),
         ("eval_every=0", {"eval_every": 0}),
     ):
         assert_refused(ConfigError, words, partial(capture.settings, **changes), changes)

@@ -1,7 +1,6 @@
 """Image files of every kind: those that are read, and what is said of the others."""
 
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -42,7 +41,7 @@ POINTER = (
         ("jpg", {"format": "MPO", "quality": 100, "subsampling": 0}),
     ],
 )
-def test_further_formats_are_read(tmp_path: Path, ending: str, options: dict) -> None:
+def test_further_formats_are_read(tmp_path, ending, options):
     if ending in ("avif", "webp") and not features.check(ending):
         pytest.skip(f"Pillow was built without {ending}")
     path = tmp_path / f"a.{ending}"
@@ -70,12 +69,12 @@ def test_further_formats_are_read(tmp_path: Path, ending: str, options: dict) ->
         ("a.jpg", b"", "cannot be decoded as an image.*truncated or damaged"),
     ],
 )  # fmt: skip
-def test_other_files_are_named_for_what_they_are(tmp_path, name, content, words) -> None:
+def test_other_files_are_named_for_what_they_are(tmp_path, name, content, words):
     (tmp_path / name).write_bytes(content)
     assert_refused(SceneError, words, partial(native_sizes, [tmp_path / name]), name)
 
 
-def test_all_files_that_cannot_be_read_are_named_at_once(tmp_path: Path) -> None:
+def test_all_files_that_cannot_be_read_are_named_at_once(tmp_path):
     paths = [tmp_path / f"{i}.jpg" for i in range(7)]
     for path in paths[1:]:
         path.write_text(POINTER)
@@ -85,7 +84,7 @@ def test_all_files_that_cannot_be_read_are_named_at_once(tmp_path: Path) -> None
     assert said.endswith("... and 1 more problems like these.")
 
 
-def test_pointers_of_git_lfs_are_named_wherever_a_file_is_read(tmp_path: Path) -> None:
+def test_pointers_of_git_lfs_are_named_wherever_a_file_is_read(tmp_path):
     words = "is a pointer of Git LFS.*git lfs pull"
     readers = {
         "model.safetensors": (LRMError, read_weights),
@@ -120,7 +119,7 @@ STORED = {
 @pytest.mark.parametrize(
     ("tag", "ending"), [*((tag, "jpg") for tag in STORED), (6, "png"), (6, "webp"), (6, "tif")]
 )
-def test_what_is_up_follows_exif(tmp_path: Path, tag: int, ending: str) -> None:
+def test_what_is_up_follows_exif(tmp_path, tag, ending):
     """Where the top of the upright picture is in the stored one, the world's z axis points."""
     upright = np.zeros((24, 32, 3), np.uint8)
     upright[:6] = 255
@@ -159,7 +158,7 @@ def test_what_is_up_follows_exif(tmp_path: Path, tag: int, ending: str) -> None:
         torch.testing.assert_close(top, torch.tensor([0.0, 0, 1]), atol=1e-5, rtol=0)
 
 
-def test_masks_and_cameras_of_turned_photos_say_exif(tmp_path: Path) -> None:
+def test_masks_and_cameras_of_turned_photos_say_exif(tmp_path):
     folder, exif = tmp_path / "room", Image.Exif()
     exif[0x0112] = 6
     (folder / "images").mkdir(parents=True)

@@ -177,7 +177,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Scene]:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_rays_pixels_masks_and_times_are_those_that_were_written(scenes, name: str) -> None:
+def test_rays_pixels_masks_and_times_are_those_that_were_written(scenes, name):
     for split, part in (("train", TRAIN), ("test", TEST)):
         views = scenes[name].splits[split]
         assert len(views) == len(part)
@@ -190,7 +190,7 @@ def test_rays_pixels_masks_and_times_are_those_that_were_written(scenes, name: s
 
 
 @pytest.mark.parametrize("name", ["nerfstudio", "colmap", "nerfies"])
-def test_masks_for_lrms_leave_the_images_whole(name: str, tmp_path: Path) -> None:
+def test_masks_for_lrms_leave_the_images_whole(name, tmp_path):
     scene = replace(FORMATS[name](tmp_path), mask_use="lrm").read()
     train, scored = scene.splits.values()
     for views, part in ((train, TRAIN), (scored, TEST)):
@@ -207,7 +207,7 @@ def test_masks_for_lrms_leave_the_images_whole(name: str, tmp_path: Path) -> Non
     assert static.is_static
 
 
-def test_masks_that_are_not_there_are_not_for_lrms(tmp_path: Path) -> None:
+def test_masks_that_are_not_there_are_not_for_lrms(tmp_path):
     made = replace(colmap(tmp_path, text=False), mask_use="lrm", masks=None)
     assert_refused(
         SceneError, r"data\.mask_use=lrm: no image has a mask file.*auto", made.read, made

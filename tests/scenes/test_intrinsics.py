@@ -395,9 +395,7 @@ def test_a_scene_that_tells_every_frames_camera_equals_one_that_tells_an_angle(t
         "both": write(tmp_path / "both", sizes, frames=[keys] * 4),
         "fl_x": write(tmp_path / "fl_x", sizes, shared={"fl_x": focal}),
         "other size": write(
-            tmp_path / "other",
-            sizes,
-            shared={key: 10 * value for key, value in keys.items()},
+            tmp_path / "other", sizes, shared={key: 10 * value for key, value in keys.items()}
         ),
         "one side": write(tmp_path / "one", sizes, shared={"fl_x": 5 * focal, "h": 60, "cx": 30}),
     }

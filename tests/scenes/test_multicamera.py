@@ -129,7 +129,7 @@ def require_rays_of(found: Views, indices: list[int]) -> None:
             assert (one - other).abs().max() < 1e-5
 
 
-def test_videos_of_neural_3d_video(videos: Path) -> None:
+def test_videos_of_neural_3d_video(videos):
     scene = read(videos)
     require_rays_of(scene.splits["test"], list(range(FRAMES)))
     require_rays_of(scene.splits["train"], list(range(FRAMES, CAMERAS * FRAMES)))
@@ -145,7 +145,7 @@ def test_videos_of_neural_3d_video(videos: Path) -> None:
         assert int(torch.stack(gaps).argmin()) == number
 
 
-def test_folders_of_images_keep_every_pixel(tmp_path: Path) -> None:
+def test_folders_of_images_keep_every_pixel(tmp_path):
     folder = neural_3d_video(tmp_path / "scene", write_images, "")
     scene = read(folder)
     assert torch.equal(scene.splits["test"].in_memory(), VIEWS.in_memory()[:FRAMES])
@@ -170,7 +170,7 @@ def test_folders_of_images_keep_every_pixel(tmp_path: Path) -> None:
         ("frames", "", "CAM_{}"),
     ],
 )
-def test_folders_of_cameras_may_have_other_names_and_levels(tmp_path, outer, inner, name) -> None:
+def test_folders_of_cameras_may_have_other_names_and_levels(tmp_path, outer, inner, name):
     plain = neural_3d_video(tmp_path / "plain", write_images, "")
     folder = tmp_path / "deeper"
     folder.mkdir()
@@ -187,7 +187,7 @@ def test_folders_of_cameras_may_have_other_names_and_levels(tmp_path, outer, inn
     assert np.array_equal(pixels.numpy(), rgb(0))
 
 
-def test_transforms_may_name_videos(videos: Path, tmp_path: Path) -> None:
+def test_transforms_may_name_videos(videos, tmp_path):
     for video in videos.glob("*.mp4"):
         (tmp_path / video.name).write_bytes(video.read_bytes())
     with_transforms(tmp_path, lambda camera: f"cam{camera:02d}.mp4")
@@ -195,7 +195,7 @@ def test_transforms_may_name_videos(videos: Path, tmp_path: Path) -> None:
     assert torch.equal(one.splits["train"].in_memory(), other.splits["train"].in_memory())
 
 
-def test_colmap_may_have_registered_an_image_of_each_camera(tmp_path: Path) -> None:
+def test_colmap_may_have_registered_an_image_of_each_camera(tmp_path):
     folder = neural_3d_video(tmp_path / "scene", write_images, "")
     (folder / "poses_bounds.npy").unlink()
     with_transforms(folder, lambda camera: f"cam{camera:02d}")
@@ -222,7 +222,7 @@ def test_colmap_may_have_registered_an_image_of_each_camera(tmp_path: Path) -> N
     assert found.video.files == expected.video.files
 
 
-def test_images_and_cameras_that_do_not_belong_together(videos: Path, tmp_path: Path) -> None:
+def test_images_and_cameras_that_do_not_belong_together(videos, tmp_path):
     folder = tmp_path / "scene"
     folder.mkdir()
     for path in videos.glob("*.mp4"):
@@ -259,7 +259,7 @@ def test_images_and_cameras_that_do_not_belong_together(videos: Path, tmp_path: 
         read(folder)
 
 
-def test_frames_by_range_and_stride(videos: Path) -> None:
+def test_frames_by_range_and_stride(videos):
     scene = read(videos, frames=[1, 5, 2], resolution=24)
     train = scene.splits["train"]
     assert train.files[:3] == ("cam01/000001", "cam01/000003", "cam01/000005")
@@ -274,7 +274,7 @@ def test_frames_by_range_and_stride(videos: Path) -> None:
     assert len(few.splits["test"]) == 2
 
 
-def test_the_video_is_that_of_a_training_camera(videos: Path) -> None:
+def test_the_video_is_that_of_a_training_camera(videos):
     centres = VIEWS.camera_to_world[::FRAMES, :3, 3]
     away = (centres - centres.mean(dim=0)).norm(dim=1)
     central = 1 + int(away[1:].argmin())
@@ -288,7 +288,7 @@ def test_the_video_is_that_of_a_training_camera(videos: Path) -> None:
             read(videos, video_camera=name)
 
 
-def test_large_captures_are_kept_on_disk(videos: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+def test_large_captures_are_kept_on_disk(videos, tmp_path, monkeypatch, capsys):
     expected = read(videos)
     before = sorted(videos.iterdir())
     monkeypatch.setattr(store, "IN_MEMORY", 0)
@@ -305,7 +305,7 @@ def test_large_captures_are_kept_on_disk(videos: Path, tmp_path: Path, monkeypat
     assert sorted(videos.iterdir()) == before
 
 
-def test_settings_of_the_command_line(videos: Path) -> None:
+def test_settings_of_the_command_line(videos):
     plain = compose_plain(
         "train",
         [
@@ -330,14 +330,14 @@ def test_settings_of_the_command_line(videos: Path) -> None:
         replace(settings, centre=[1, 2])
 
 
-def test_a_camera_is_held_out_by_default(videos: Path, tmp_path: Path, caplog) -> None:
+def test_a_camera_is_held_out_by_default(videos, tmp_path, caplog):
     with caplog.at_level("INFO"):
         scene = read(videos, test_cameras=None)
     assert {file.split("/")[0] for file in scene.splits["test"].files} == {"cam00"}
     assert "held out cam00 of the cameras cam00, cam01" in caplog.text
 
 
-def test_cameras_of_different_lengths_and_rates(videos: Path, tmp_path: Path, caplog) -> None:
+def test_cameras_of_different_lengths_and_rates(videos, tmp_path, caplog):
     folder = tmp_path / "scene"
     folder.mkdir()
     for path in videos.iterdir():
@@ -362,7 +362,7 @@ def test_cameras_of_different_lengths_and_rates(videos: Path, tmp_path: Path, ca
 
 @pytest.mark.parametrize("apart", [0, 100])
 @pytest.mark.parametrize("gone", [[FRAMES - 1], [2], [0], [1, FRAMES - 1]])
-def test_a_frame_that_one_camera_lacks_is_left_out(tmp_path: Path, apart: int, gone: list) -> None:
+def test_a_frame_that_one_camera_lacks_is_left_out(tmp_path, apart, gone):
     folder = neural_3d_video(tmp_path / "scene", write_images, "")
     whole = read(folder).splits["train"]
     for camera in range(CAMERAS):  # Cameras may have their own numbers for the same moment.
@@ -382,7 +382,7 @@ def test_a_frame_that_one_camera_lacks_is_left_out(tmp_path: Path, apart: int, g
     assert torch.equal(views.in_memory(), whole.in_memory()[places])
 
 
-def test_images_that_are_missing_beside_videos(tmp_path: Path) -> None:
+def test_images_that_are_missing_beside_videos(tmp_path):
     folder = neural_3d_video(tmp_path / "scene", write_images, "")
     write_video(folder / "cam03.mp4", rgb(3))
     shutil.rmtree(folder / "cam03")
@@ -391,7 +391,7 @@ def test_images_that_are_missing_beside_videos(tmp_path: Path) -> None:
         read(folder)
 
 
-def test_folders_beside_cameras_are_none(tmp_path: Path) -> None:
+def test_folders_beside_cameras_are_none(tmp_path):
     folder = neural_3d_video(tmp_path / "scene", write_images, "")
     whole = read(folder).splits["train"]
     for name in ("camera_paths", "mv_images/00000", "mv_images/00001"):
@@ -399,7 +399,7 @@ def test_folders_beside_cameras_are_none(tmp_path: Path) -> None:
     assert torch.equal(read(folder).splits["train"].in_memory(), whole.in_memory())
 
 
-def test_damaged_files_are_named(videos: Path, tmp_path: Path) -> None:
+def test_damaged_files_are_named(videos, tmp_path):
     folder = tmp_path / "scene"
     folder.mkdir()
     for path in videos.iterdir():
@@ -454,7 +454,7 @@ def test_damaged_files_are_named(videos: Path, tmp_path: Path) -> None:
     refused(r"another pose than .* data=nerfstudio")
 
 
-def test_cameras_of_images_need_no_pyav(tmp_path: Path, monkeypatch, videos: Path) -> None:
+def test_cameras_of_images_need_no_pyav(tmp_path, monkeypatch, videos):
     folder = neural_3d_video(tmp_path / "scene", write_images, "")
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     assert len(read_cameras(folder)) == CAMERAS
@@ -463,7 +463,7 @@ def test_cameras_of_images_need_no_pyav(tmp_path: Path, monkeypatch, videos: Pat
         read(videos)
 
 
-def test_frames_that_an_edit_list_hides_are_not_counted(tmp_path: Path) -> None:
+def test_frames_that_an_edit_list_hides_are_not_counted(tmp_path):
     whole, cut = tmp_path / "whole.mp4", tmp_path / "cut.mp4"
     write_video(whole, np.stack([np.full((32, 32, 3), 8 * i, np.uint8) for i in range(30)]))
     tool = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
@@ -492,7 +492,7 @@ def write_stamped(path: Path, frames: np.ndarray, stamps: list[int], **stream_op
         container.mux(stream.encode())
 
 
-def test_times_of_variable_frame_rates_are_those_of_the_files(tmp_path: Path) -> None:
+def test_times_of_variable_frame_rates_are_those_of_the_files(tmp_path):
     folder = neural_3d_video(tmp_path / "scene", write_video, ".mkv")
     stamps = [0, 33, 67, 233, 267, 300]
     for camera in range(CAMERAS):
@@ -501,7 +501,7 @@ def test_times_of_variable_frame_rates_are_those_of_the_files(tmp_path: Path) ->
     assert times[:FRAMES].tolist() == pytest.approx([stamp / 300 for stamp in stamps], abs=0.01)
 
 
-def test_a_camera_that_begins_later_is_told_of(tmp_path: Path) -> None:
+def test_a_camera_that_begins_later_is_told_of(tmp_path):
     folder = neural_3d_video(tmp_path / "scene", write_video, ".mkv")
     for camera in range(CAMERAS):
         late = 400 if camera == 2 else 0
@@ -513,7 +513,7 @@ def test_a_camera_that_begins_later_is_told_of(tmp_path: Path) -> None:
         )
 
 
-def test_hdr_videos_are_told_of(tmp_path: Path) -> None:
+def test_hdr_videos_are_told_of(tmp_path):
     for curve, word in ((18, "HLG"), (16, "PQ")):
         path = tmp_path / f"{word}.mkv"
         write_stamped(path, rgb(0), [33 * i for i in range(FRAMES)], color_trc=curve)

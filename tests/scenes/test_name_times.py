@@ -39,7 +39,7 @@ from xplanes.scenes.name_times import times_in_names
         ("cam1 cam2 cam5", [0, 0.25, 1]),
     ],
 )
-def test_names_tell_times(names: str, times: list[float]) -> None:
+def test_names_tell_times(names, times):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = times_in_names([f"{name}.png" for name in names.split()])
@@ -55,7 +55,7 @@ def test_names_tell_times(names: str, times: list[float]) -> None:
         (["t_-2.png", "t_1.png", "t_2.png"], "-2"),
     ],
 )
-def test_times_that_are_hardly_those_of_the_images_are_shown(names, words) -> None:
+def test_times_that_are_hardly_those_of_the_images_are_shown(names, words):
     with pytest.warns(UserWarning, match=words):
         assert len(times_in_names(names)) == len(names)
 
@@ -68,6 +68,6 @@ def test_times_that_are_hardly_those_of_the_images_are_shown(names, words) -> No
         (["a_1.png", "b_1.png"], "give one number"),
     ],
 )
-def test_names_without_an_order_are_one_timestep(names, words) -> None:
+def test_names_without_an_order_are_one_timestep(names, words):
     with pytest.warns(UserWarning, match=f"{words}(.|\n)*one timestep.*data.static=true"):
         assert times_in_names(names) == []

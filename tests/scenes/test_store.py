@@ -76,7 +76,7 @@ SIZES = [(130, 70), (64, 64), (63, 129), (1, 1)]
 
 
 @pytest.mark.parametrize("alpha", [False, True])
-def test_a_file_holds_the_pixels_of_memory(tmp_path: Path, monkeypatch, alpha: bool) -> None:
+def test_a_file_holds_the_pixels_of_memory(tmp_path, monkeypatch, alpha):
     paths = pictures(tmp_path / "scene", SIZES, alpha=alpha)
     expected, native, sizes = read_images(paths, None)
     monkeypatch.setattr(store, "IN_MEMORY", 4 * 4 * 130 * 129 - 1)
@@ -100,7 +100,7 @@ def test_a_file_holds_the_pixels_of_memory(tmp_path: Path, monkeypatch, alpha: b
     assert isinstance(read_images(paths, None)[0], torch.Tensor)
 
 
-def test_reduced_images_are_the_same_too(tmp_path: Path, small) -> None:
+def test_reduced_images_are_the_same_too(tmp_path, small):
     paths = pictures(tmp_path / "scene", [(70, 70)] * 2, alpha=True)
     images, _, sizes = read_images(paths, 66, tmp_path / "cache")
     assert sizes == [(66, 66)] * 2
@@ -110,7 +110,7 @@ def test_reduced_images_are_the_same_too(tmp_path: Path, small) -> None:
     assert torch.equal(images.image(1), expected[1])
 
 
-def test_pixels_near_silhouettes_are_told_by_eights() -> None:
+def test_pixels_near_silhouettes_are_told_by_eights():
     views = ball_views(2, 0.15, size=400)
     settings = replace(RAYS, skip_background=True, background_share=0.0)
     batches = RayBatches(stored(views), FRAME, settings, seed=0)
@@ -122,7 +122,7 @@ def test_pixels_near_silhouettes_are_told_by_eights() -> None:
     assert lit == pytest.approx(shown, rel=0.1)
 
 
-def test_views_in_a_file_tell_the_same_as_views_in_memory() -> None:
+def test_views_in_a_file_tell_the_same_as_views_in_memory():
     views = ball_views(6, 0.6, size=150)
     tiled = stored(views)
     assert tiled.is_stored
@@ -144,7 +144,7 @@ def test_views_in_a_file_tell_the_same_as_views_in_memory() -> None:
     assert tiled.identity != both.identity
 
 
-def test_views_in_a_file_leave_room_for_the_same() -> None:
+def test_views_in_a_file_leave_room_for_the_same():
     views = ball_views(4, 0.3, size=300)
     points = torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) * 3 - 1.5
     memory, file = (may_hold(those, points, radius=0.02) for those in (views, stored(views)))
@@ -171,7 +171,7 @@ def numbered(sizes) -> Views:
     return replace(views, images=StoredImages.all_of(PixelFile.of(images)), intrinsics=intrinsics)
 
 
-def test_every_pixel_is_drawn_as_often_as_any_other() -> None:
+def test_every_pixel_is_drawn_as_often_as_any_other():
     sizes = [(70, 130), (33, 64), (64, 5)]
     views = numbered(sizes)
     batches = RayBatches(views, FRAME, replace(RAYS, per_batch=3000), seed=0)
@@ -206,7 +206,7 @@ def test_every_pixel_is_drawn_as_often_as_any_other() -> None:
     assert abs(chi_squared - (RUN - 1)) < 5 * (2 * RUN) ** 0.5
 
 
-def test_no_pixel_is_drawn_that_a_fisheye_lens_leaves_dark() -> None:
+def test_no_pixel_is_drawn_that_a_fisheye_lens_leaves_dark():
     views = numbered([(150, 150)] * 2)
     lenses = replace(Lenses.pinholes(2), model=torch.full((2,), int(LensModel.FISHEYE)), limit=None)
     intrinsics = replace(views.intrinsics, focal=torch.full((2, 2), 30.0), lenses=lenses)
@@ -235,7 +235,7 @@ def test_no_pixel_is_drawn_that_a_fisheye_lens_leaves_dark() -> None:
     assert drawn[shown].min() > 0
 
 
-def test_runs_far_from_silhouettes_get_the_asked_share() -> None:
+def test_runs_far_from_silhouettes_get_the_asked_share():
     views = stored(ball_views(3, 0.15, size=400))
     for share in (0.0, 0.2):
         settings = replace(
@@ -258,7 +258,7 @@ def test_runs_far_from_silhouettes_get_the_asked_share() -> None:
         assert lit == pytest.approx((1 - share) * shown / (1 - natural), rel=0.25)
 
 
-def test_a_batch_from_a_file_depends_on_seed_step_and_rank_alone(tmp_path: Path, small) -> None:
+def test_a_batch_from_a_file_depends_on_seed_step_and_rank_alone(tmp_path, small):
     paths = pictures(tmp_path / "scene", [(200, 200)] * 4, alpha=False)
     images, *_ = read_images(paths, None, tmp_path / "cache")
     views = replace(ball_views(4, 0.5, size=200), images=images)
@@ -278,7 +278,7 @@ def test_a_batch_from_a_file_depends_on_seed_step_and_rank_alone(tmp_path: Path,
     assert len(few["times"]) == 7
 
 
-def test_runs_of_coming_steps_are_announced_once(monkeypatch) -> None:
+def test_runs_of_coming_steps_are_announced_once(monkeypatch):
     views = numbered([(200, 200)] * 3)
     told: list[tuple[int, int]] = []
     read: list[tuple[int, int]] = []
@@ -302,7 +302,7 @@ def test_runs_of_coming_steps_are_announced_once(monkeypatch) -> None:
     assert told[: 3 * per_step] == read[per_step:]
 
 
-def test_draws_from_memory_are_those_of_scattered_pixels() -> None:
+def test_draws_from_memory_are_those_of_scattered_pixels():
     views = ball_views(5, 0.5, size=40)
     for skip in (False, True):
         batches = RayBatches(views, FRAME, replace(RAYS, skip_background=skip), seed=7, rank=2)
@@ -333,7 +333,7 @@ def private_bytes() -> int:
 
 
 @pytest.mark.skipif(not Path("/proc/self/smaps_rollup").is_file(), reason="needs Linux's /proc")
-def test_drawing_takes_no_memory_of_the_images(tmp_path: Path, small, capsys) -> None:
+def test_drawing_takes_no_memory_of_the_images(tmp_path, small, capsys):
     size, count = (1024, 1024), 20
 
     def job(index):
@@ -359,7 +359,7 @@ def test_drawing_takes_no_memory_of_the_images(tmp_path: Path, small, capsys) ->
     assert str(tmp_path / "cache") in said
 
 
-def test_the_cache_is_used_again_until_a_source_changes(tmp_path: Path, small, capsys) -> None:
+def test_the_cache_is_used_again_until_a_source_changes(tmp_path, small, capsys):
     paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=False)
     cache = tmp_path / "cache"
     first = read_images(paths, None, cache)[0]
@@ -379,7 +379,7 @@ def test_the_cache_is_used_again_until_a_source_changes(tmp_path: Path, small, c
     assert not [path for path in (tmp_path / "scene").iterdir() if path.suffix != ".png"]
 
 
-def test_a_file_that_was_cut_off_is_made_anew(tmp_path: Path, small) -> None:
+def test_a_file_that_was_cut_off_is_made_anew(tmp_path, small):
     paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=True)
     images = read_images(paths, None, tmp_path / "cache")[0]
     (path,) = (tmp_path / "cache").glob("*.pixels")
@@ -391,7 +391,7 @@ def test_a_file_that_was_cut_off_is_made_anew(tmp_path: Path, small) -> None:
     assert torch.equal(again.image(2), expected)
 
 
-def test_a_damaged_image_leaves_nothing_behind(tmp_path: Path, small) -> None:
+def test_a_damaged_image_leaves_nothing_behind(tmp_path, small):
     paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=False)
     content = paths[1].read_bytes()
     paths[1].write_bytes(content[: len(content) // 2])
@@ -402,7 +402,7 @@ def test_a_damaged_image_leaves_nothing_behind(tmp_path: Path, small) -> None:
     assert read_images(paths, None, tmp_path / "cache")[0].shape[0] == 3
 
 
-def test_a_disk_without_space_is_refused_first(tmp_path: Path, small, monkeypatch) -> None:
+def test_a_disk_without_space_is_refused_first(tmp_path, small, monkeypatch):
     paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=False)
     usage = shutil.disk_usage(tmp_path)._replace(free=2**28 + 100)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
@@ -411,7 +411,7 @@ def test_a_disk_without_space_is_refused_first(tmp_path: Path, small, monkeypatc
     assert not list((tmp_path / "cache").glob("*.pixels"))
 
 
-def test_the_cache_is_the_users_if_none_is_named(tmp_path: Path, small, monkeypatch) -> None:
+def test_the_cache_is_the_users_if_none_is_named(tmp_path, small, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
     monkeypatch.setattr("sys.platform", "linux")
     paths = pictures(tmp_path / "scene", [(65, 65)], alpha=False)
@@ -419,9 +419,7 @@ def test_the_cache_is_the_users_if_none_is_named(tmp_path: Path, small, monkeypa
     assert len(list((tmp_path / "home" / "xplanes" / "images").glob("*.pixels"))) == 1
 
 
-def test_what_no_run_has_used_for_a_month_is_removed(
-    tmp_path: Path, small, monkeypatch, capsys
-) -> None:
+def test_what_no_run_has_used_for_a_month_is_removed(tmp_path, small, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
     monkeypatch.setattr("sys.platform", "linux")
     cache = tmp_path / "home" / "xplanes" / "images"
@@ -466,7 +464,7 @@ def test_what_no_run_has_used_for_a_month_is_removed(
     assert torch.equal(read_images(paths[:1], None)[0].image(0), expected)
 
 
-def test_a_cache_that_is_named_is_the_users_to_clean(tmp_path: Path, small, capsys) -> None:
+def test_a_cache_that_is_named_is_the_users_to_clean(tmp_path, small, capsys):
     paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=False)
     cache = tmp_path / "cache"
     read_images(paths[:1], None, cache)
@@ -477,7 +475,7 @@ def test_a_cache_that_is_named_is_the_users_to_clean(tmp_path: Path, small, caps
     assert old.exists()
 
 
-def test_an_interrupted_decoder_stops_soon(tmp_path: Path, small) -> None:
+def test_an_interrupted_decoder_stops_soon(tmp_path, small):
     source = tmp_path / "source"
     source.write_bytes(b"")
     begun = threading.Event()
@@ -501,7 +499,7 @@ def test_an_interrupted_decoder_stops_soon(tmp_path: Path, small) -> None:
     assert time.monotonic() - began < 1.5
 
 
-def test_files_on_a_read_only_disk_are_read(tmp_path: Path, small, monkeypatch) -> None:
+def test_files_on_a_read_only_disk_are_read(tmp_path, small, monkeypatch):
     paths = pictures(tmp_path / "scene", [(65, 65)] * 2, alpha=False)
     first = read_images(paths, None, cache=tmp_path / "cache")[0]
 
@@ -515,7 +513,7 @@ def test_files_on_a_read_only_disk_are_read(tmp_path: Path, small, monkeypatch) 
     assert torch.equal(again.image(1), first.image(1))
 
 
-def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path, small, monkeypatch) -> None:
+def test_a_cache_that_cannot_be_written_is_named(tmp_path, small, monkeypatch):
     paths = pictures(tmp_path / "scene", [(65, 65)] * 2, alpha=False)
     file = tmp_path / "file"
     file.write_text("")

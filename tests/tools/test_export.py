@@ -36,9 +36,7 @@ from xplanes.scenes.cameras import PosedCamera, orbit
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
 from xplanes.tools import export as module
-from xplanes.tools.camera_path import (
-    read_camera_path,
-)
+from xplanes.tools.camera_path import read_camera_path
 from xplanes.tools.export import ExportOptions, export, export_times
 from xplanes.tools.runs import TrainedRun, load_run
 from xplanes.training.scores import score_view

@@ -118,7 +118,7 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, type[Hub]]]:
         yield address, handler
 
 
-def test_a_run_comes_back_from_the_hub_as_it_was_pushed(hub, trained_run: Path, tmp_path: Path):
+def test_a_run_comes_back_from_the_hub_as_it_was_pushed(hub, trained_run, tmp_path):
     address, held = hub
     said: list[str] = []
     url = push(trained_run, "somebody/excavator", say=said.append, endpoint=address)
@@ -149,7 +149,7 @@ def test_a_run_comes_back_from_the_hub_as_it_was_pushed(hub, trained_run: Path, 
     assert said[-1].startswith("offline     ")
 
 
-def test_what_names_the_machine_stays_there(hub, trained_run: Path):
+def test_what_names_the_machine_stays_there(hub, trained_run):
     address, held = hub
     push(trained_run, "somebody/excavator", say=print, endpoint=address)
     mine = json.loads((trained_run / "run.json").read_text())
@@ -163,7 +163,7 @@ def card_of(run: Path) -> tuple[dict[str, Any], str]:
     return yaml.safe_load(head), text
 
 
-def test_the_model_card_has_scores_command_and_licence(trained_run: Path, tmp_path: Path):
+def test_the_model_card_has_scores_command_and_licence(trained_run, tmp_path):
     head, text = card_of(trained_run)
     metrics = json.loads((trained_run / "metrics.json").read_text())
     assert head["library_name"] == "xplanes"
@@ -179,11 +179,7 @@ def test_the_model_card_has_scores_command_and_licence(trained_run: Path, tmp_pa
     run = tmp_path / "run"
     shutil.copytree(trained_run, run)
     config = yaml.safe_load((run / "config.yaml").read_text())
-    config["lrm"] = {
-        "name": "base",
-        "repository": "somebody/lrm",
-        "licence": "CC-BY-NC-4.0",
-    }
+    config["lrm"] = {"name": "base", "repository": "somebody/lrm", "licence": "CC-BY-NC-4.0"}
     (run / "config.yaml").write_text(yaml.safe_dump(config))
     head, text = card_of(run)
     assert (head["license"], head["base_model"]) == ("cc-by-nc-4.0", "somebody/lrm")
@@ -193,9 +189,7 @@ def test_the_model_card_has_scores_command_and_licence(trained_run: Path, tmp_pa
     assert "bundled with X-Planes (MIT licence)" in card_of(run)[1]
 
 
-def test_commands_read_a_run_of_the_hub(
-    hub, trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
-):
+def test_commands_read_a_run_of_the_hub(hub, trained_run, tmp_path, monkeypatch, capsys):
     address, _ = hub
     monkeypatch.chdir(tmp_path)
     for name, verb in (("push", push), ("fetch", fetch)):
@@ -209,9 +203,7 @@ def test_commands_read_a_run_of_the_hub(
     assert "fetching    hf://somebody/excavator" in capsys.readouterr().out
 
 
-def test_what_cannot_be_is_refused_in_words(
-    hub, trained_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_what_cannot_be_is_refused_in_words(hub, trained_run, tmp_path, monkeypatch):
     address, _ = hub
     options: dict[str, Any] = {"say": print, "outputs": tmp_path}
     with pytest.raises(ConfigError, match="excavator: a repository on the hub is written USER/"):

@@ -290,12 +290,7 @@ WRONG = {
     "a cut scene": (ball, {"half_side": 0.5}, "cut", "cuts off .*% of the foreground"),
     "a shared file": (same_file, {}, "shared", r"1 of 4 test.*\(train/003.png is train/003"),
     "a shared camera": (same_camera, {}, "shared", r"1 of 4 test.*\(test/002.png is train/005"),
-    "shared pixels": (
-        same_pixels,
-        {},
-        "shared",
-        r"2 of 4 .* pixels \(test/001.png is train/007",
-    ),
+    "shared pixels": (same_pixels, {}, "shared", r"2 of 4 .* pixels \(test/001.png is train/007"),
     "white on white": (lambda: painted(ball(), white), {}, "white", "100% of the silhouettes"),
     "opaque white": (lambda: painted(ball(), on_white), {}, "white", "the images are opaque"),
     "empty images": (lambda: painted(ball(), emptied), {}, "empty", "8 of 20 images show"),

@@ -12,14 +12,7 @@ from xplanes.errors import ConfigError
 from xplanes.evaluation.render import write_video
 from xplanes.optional import MissingExtraError
 from xplanes.rendering.pictures import to_bytes
-from xplanes.tools.render import (
-    VideoOptions,
-    cameras,
-    check_out,
-    find_view,
-    render_video,
-    times,
-)
+from xplanes.tools.render import VideoOptions, cameras, check_out, find_view, render_video, times
 from xplanes.tools.runs import TrainedRun, load_run
 from xplanes.training.scores import score_view
 

@@ -51,7 +51,7 @@ def state_of(folder: Path) -> dict:
     return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
 
 
-def test_they_are_zero_until_their_first_step_and_go_on_exactly(scenes: Path, tmp_path: Path):
+def test_they_are_zero_until_their_first_step_and_go_on_exactly(scenes, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     for steps in (8, 9, 12):
         # A limit in steps is no schedule: the rates depend on the share of it that is done.
@@ -68,9 +68,7 @@ def test_they_are_zero_until_their_first_step_and_go_on_exactly(scenes: Path, tm
     assert [group["name"] for group in groups] == ["space", "time", "fine", "decoder"]
 
 
-def test_a_checkpoint_knows_how_many_texels_the_images_asked_for(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_checkpoint_knows_how_many_texels_the_images_asked_for(scenes, tmp_path, monkeypatch):
     monkeypatch.setattr(x_planes, "TEXEL_STEP", 4)
     config = small_config(scenes, "model.resolution=8", "trainer.max_steps=2")
     run(config, tmp_path, [], resume=False)

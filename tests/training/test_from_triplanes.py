@@ -327,12 +327,7 @@ def test_a_run_from_one_triplane_is_loaded_too(place, tmp_path):
 
 
 def test_an_unconverged_decomposition_warns_once(place, tmp_path, capfd):
-    config = settings(
-        place,
-        "decomposition.max_iterations=3",
-        "trainer.max_steps=2",
-        UNSCORED,
-    )
+    config = settings(place, "decomposition.max_iterations=3", "trainer.max_steps=2", UNSCORED)
     run(config, tmp_path / "run", [], resume=False)
     said = capfd.readouterr()
     assert said.err.count("did not converge") == 1

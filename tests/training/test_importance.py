@@ -1,7 +1,5 @@
 """Importance sampling in training: from its first step on, resumed, and only where it is wanted."""
 
-from pathlib import Path
-
 import pytest
 import torch
 
@@ -32,8 +30,8 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, bool]]:
 
 
 def test_rays_are_weighted_from_its_first_batch_on_and_a_resumed_run_draws_the_same(
-    scenes: Path, tmp_path: Path, soon: list[tuple[int, bool]]
-) -> None:
+    scenes, tmp_path, soon
+):
     for steps in (5, 11):
         config = small_config(scenes, "model.final_lr=1.0", f"trainer.max_steps={steps}")
         run(config, tmp_path / "parts", [], resume=steps > 5)
@@ -47,17 +45,13 @@ def test_rays_are_weighted_from_its_first_batch_on_and_a_resumed_run_draws_the_s
 
 
 @pytest.mark.parametrize("override", ["model.rays.error_share=0", "recipe=fair"])
-def test_without_it_no_ray_is_weighted(
-    scenes: Path, tmp_path: Path, soon: list[tuple[int, bool]], override: str
-) -> None:
+def test_without_it_no_ray_is_weighted(scenes, tmp_path, soon, override):
     run(small_config(scenes, override, "trainer.max_steps=5"), tmp_path, [], resume=False)
     assert soon == [(batch, False) for batch in range(5)]
     assert checkpoint(tmp_path)["error_map"]["sums"].numel() == 0
 
 
-def test_a_checkpoint_without_a_map_is_read(
-    scenes: Path, tmp_path: Path, soon: list[tuple[int, bool]]
-) -> None:
+def test_a_checkpoint_without_a_map_is_read(scenes, tmp_path, soon):
     run(small_config(scenes, "trainer.max_steps=4"), tmp_path, [], resume=False)
     path = tmp_path / "checkpoints" / "last.ckpt"
     content = checkpoint(tmp_path)

@@ -52,7 +52,7 @@ def note_checkpoints(written: list[tuple[str, dict]], monkeypatch: pytest.Monkey
     monkeypatch.setattr(AtomicCheckpointIO, "save_checkpoint", note)
 
 
-def test_a_run_is_not_resumed_with_other_settings(scenes: Path, folder: Path) -> None:
+def test_a_run_is_not_resumed_with_other_settings(scenes, folder):
     before = {name: (folder / name).read_bytes() for name in PAGES}
     refused = {
         "model=nine_planes": r"model\.name=nine_planes: .* trained with model\.name=six_planes",
@@ -71,7 +71,7 @@ def test_a_run_is_not_resumed_with_other_settings(scenes: Path, folder: Path) ->
     assert (metrics["step"], len(metrics["views"])) == (8, 2)
 
 
-def test_a_run_is_not_resumed_with_other_images(scenes: Path, folder: Path) -> None:
+def test_a_run_is_not_resumed_with_other_images(scenes, folder):
     record = json.loads((folder / "run.json").read_text())
     record["files"]["train"].reverse()
     (folder / "run.json").write_text(json.dumps(record))
@@ -80,9 +80,7 @@ def test_a_run_is_not_resumed_with_other_images(scenes: Path, folder: Path) -> N
             run(small_config(scenes, *FEW), folder, [], resume=True)
 
 
-def test_the_best_is_chosen_by_the_same_views_throughout(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_best_is_chosen_by_the_same_views_throughout(scenes, tmp_path, monkeypatch):
     """One view is scored on the way, and the others are harder by 10 dB."""
     original = scores.score_image
     improved: list[tuple[str, dict]] = []
@@ -104,9 +102,7 @@ def test_the_best_is_chosen_by_the_same_views_throughout(
     assert len(metrics["views"]) == 3  # In the end all are looked at.
 
 
-def test_no_checkpoint_between_the_batches_of_an_update(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_checkpoint_between_the_batches_of_an_update(scenes, tmp_path, monkeypatch):
     """A run that goes on from a checkpoint's step has written none for it yet."""
     written: list[tuple[str, dict]] = []
     every = (*FEW, "trainer.accumulate_grad_batches=4", "callbacks.checkpoints.every=2")
@@ -119,9 +115,7 @@ def test_no_checkpoint_between_the_batches_of_an_update(
     assert all(count % 4 == 0 for count in batches)
 
 
-def test_a_signal_after_the_last_step_is_heard(
-    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_signal_after_the_last_step_is_heard(scenes, tmp_path, monkeypatch):
     finish = RadianceModule.on_train_end
 
     def press_ctrl_c(self) -> None:
@@ -145,7 +139,7 @@ class Fails(Callback):
             raise RuntimeError("a fault of one's own")
 
 
-def test_a_fault_of_ones_own_says_how_to_go_on(scenes: Path, tmp_path: Path, capsys) -> None:
+def test_a_fault_of_ones_own_says_how_to_go_on(scenes, tmp_path, capsys):
     config = small_config(scenes, *FEW, "media=false", "lrm=none", "trainer.max_steps=5")
     config["callbacks"] |= {"fails": {"_target_": f"{__name__}.Fails"}}
     config["plugins"] = [__name__]
@@ -156,7 +150,7 @@ def test_a_fault_of_ones_own_says_how_to_go_on(scenes: Path, tmp_path: Path, cap
     run(config, tmp_path / "run", [], resume=True)
 
 
-def test_another_start_in_a_folder_begins_its_own_record(tmp_path: Path) -> None:
+def test_another_start_in_a_folder_begins_its_own_record(tmp_path):
     first = RunRecord(tmp_path, 0, resume=False)
     first.note(files={"train": ["a.png"]})
     first.content["started"] = "long ago"
@@ -178,7 +172,7 @@ def nested(key: str, value: object) -> dict[str, Any]:
     return found  # type: ignore[return-value]
 
 
-def test_what_planes_and_frame_depend_on_is_kept(tmp_path: Path) -> None:
+def test_what_planes_and_frame_depend_on_is_kept(tmp_path):
     def goes_on(before: dict[str, Any], now: dict[str, Any]) -> None:
         (tmp_path / "config.yaml").write_text(yaml.safe_dump(before))
         require_same_run(tmp_path, now, -1)
@@ -196,7 +190,7 @@ def test_what_planes_and_frame_depend_on_is_kept(tmp_path: Path) -> None:
             goes_on(without, that)
 
 
-def test_a_limit_that_a_run_has_passed_is_refused(scenes: Path, folder: Path) -> None:
+def test_a_limit_that_a_run_has_passed_is_refused(scenes, folder):
     before = (folder / "config.yaml").read_bytes()
     with pytest.raises(ConfigError, match=r"max_steps=3: .*has done 6 steps already"):
         run(small_config(scenes, *FEW, "trainer.max_steps=3"), folder, [], resume=True)
@@ -208,8 +202,8 @@ def test_a_limit_that_a_run_has_passed_is_refused(scenes: Path, folder: Path) ->
     [(10, ("val", "test"), 10), (20, ("val", "test"), 2), (10, ("val",), 3)],
 )
 def test_a_missing_split_is_held_out_of_training_or_nothing_is_the_best(
-    scenes: Path, tmp_path: Path, views: int, missing: tuple[str, ...], scored: int
-) -> None:
+    scenes, tmp_path, views, missing, scored
+):
     demo = small_config(scenes, *FEW, "callbacks.evaluation.at=[0]")
     made = SceneDataModule(demo["data"])
     folder = Path(shutil.copytree(made.settings.folder, tmp_path / "scenes" / "few"))

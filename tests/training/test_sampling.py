@@ -20,11 +20,7 @@ def fog(points, times):
 
 @pytest.fixture
 def sampling(tmp_path) -> OccupancySampler:
-    config = small_config(
-        tmp_path,
-        "model.sampler.samples=15",
-        "model.sampler.render_samples=40",
-    )
+    config = small_config(tmp_path, "model.sampler.samples=15", "model.sampler.render_samples=40")
     site = Site(cube_frame(1.0, torch.zeros(3)), times=torch.zeros(1), seed=0, precision="32")
     return Method.read(config).model.sampler.build(fog, site)
 

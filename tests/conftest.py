@@ -1,5 +1,6 @@
 """Lets every test import `tests.oracles`, from wherever pytest is started."""
 
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +27,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         from tests.fake_device import register
 
         register()
+
+
+def pytest_collection_finish() -> None:
+    """The garbage collector need not look through all that was imported again and again."""
+    gc.collect()
+    gc.freeze()
+
+
+def pytest_unconfigure() -> None:
+    gc.unfreeze()
 
 
 @pytest.fixture

@@ -713,6 +713,7 @@ def test_no_wing_is_imported_by_the_core_or_by_another():
         assert not found, f"{module} imports {found}"
 
 
+@pytest.mark.slow
 def test_the_core_runs_without_its_wings():
     core = {name.removesuffix(".__init__") for name in sources() if room(name) not in WINGS}
     core -= {"train", "xplanes.__main__"}

@@ -17,7 +17,7 @@ pytest.importorskip("trimesh")
 pytest.importorskip("skimage")
 
 OF_THE_LRM = ("lrm=", "model.channels", "model.decoder")
-SHORT = [*(text for text in SMALL if not text.startswith(OF_THE_LRM)), "preparation.frames=6"]
+SHORT = [*(text for text in SMALL if not text.startswith(OF_THE_LRM)), "preparation.frames=3"]
 
 
 @pytest.fixture

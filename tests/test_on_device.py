@@ -314,7 +314,8 @@ BUDGETS = {
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "nine")) for n in BUDGETS]
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] * (n in ("nine", "tensor4d"))) for n in BUDGETS],
 )
 def test_steps_keep_to_their_budget_and_views_are_scored(fake_gpu, name):
     module, data, steps = trained(name, max(BUDGETS[name]) + 1)

@@ -23,6 +23,7 @@ from tests.balls import ball_scene
 from tests.inside import train
 from tests.test_contracts import built, small
 from tests.training.runs import SMALL as SMALL_RUN
+from tests.training.runs import changed
 from xplanes.config import CONF, compose_plain, group_options
 from xplanes.errors import ConfigError, LRMError
 from xplanes.experiment import Experiment
@@ -74,7 +75,7 @@ def test_sweeps_have_the_papers_scenes_and_rows():
         assert len(values_of(found, "data.scene")) == scenes, name
         assert len({tuple(job) for job in found}) == len(found) == scenes * runs, name
         if name != "ablation":
-            plain = compose_plain("train", found[0])
+            plain = changed((), *found[0])
             assert (plain["data"]["name"], plain["data"]["resolution"]) == ("dnerf", 400), name
             assert plain["data"]["eval_split"] is None, name
             assert plain["trainer"]["max_seconds"] is None, name
@@ -172,7 +173,7 @@ def does_a_step(chosen: list[tuple[str, ...]]) -> None:
 def test_fair_means_equal_rays_samples_and_terms():
     rays, samplers, losses = set(), set(), set()
     for overrides in jobs_of("sweep=fair", "data.scene=lego"):
-        plain = compose_plain("train", overrides)
+        plain = changed((), *overrides)
         experiment = Experiment.read(plain)
         model = experiment.method.model
         rays.add(str(model.rays))
@@ -187,21 +188,21 @@ def test_fair_means_equal_rays_samples_and_terms():
 
 @pytest.mark.parametrize("chosen", [["recipe=paper", "lrm=tiny"], []])
 def test_the_ablation_changes_one_thing_at_a_time(chosen):
-    whole = compose_plain("train", chosen)
+    whole = changed((), *chosen)
     for overrides in jobs_of("sweep=ablation", "data.scene=excavator", "seed=0", *chosen):
-        plain = compose_plain("train", overrides)
-        changed = {group for group in whole if plain[group] != whole[group]}
+        plain = changed((), *overrides)
+        others = {group for group in whole if plain[group] != whole[group]}
         random = "lrm=none" in overrides
-        assert ("lrm" in changed) == random, overrides
+        assert ("lrm" in others) == random, overrides
         assert plain["lrm"]["name"] == ("none" if random else whole["lrm"]["name"])
-        assert len(changed - {"lrm"}) <= 1, overrides
+        assert len(others - {"lrm"}) <= 1, overrides
 
 
 def test_published_lrms_have_their_own_names_beside_the_papers():
     assert set(ALIASES) <= set(group_options("lrm"))
     for alias, name in ALIASES.items():
-        plain = compose_plain("train", [f"lrm={alias}"])["lrm"]
-        assert plain == compose_plain("train", [f"lrm={name}"])["lrm"]
+        plain = changed((), f"lrm={alias}")["lrm"]
+        assert plain == changed((), f"lrm={name}")["lrm"]
         assert plain["architecture"].startswith(alias.replace("_", "-"))
 
 

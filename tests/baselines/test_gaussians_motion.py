@@ -163,6 +163,7 @@ def test_halves_keep_their_time_and_their_path():
         assert not optimizer.state[getattr(field, name)]["exp_avg"][20:].any(), name
 
 
+@pytest.mark.slow
 def test_first_points_lie_on_what_a_field_shows(tmp_path, monkeypatch):
     """A ball that swings: points on its surface, where it is at their times."""
     path, radius = swinging(0.4, 1), 0.35

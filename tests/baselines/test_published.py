@@ -7,7 +7,8 @@ import pytest
 import yaml
 
 from tests.test_sweeps import jobs_of
-from xplanes.config import CONF, compose_plain
+from tests.training.runs import changed
+from xplanes.config import CONF
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.tools.sweep import RunRow, flatten
@@ -69,9 +70,7 @@ OURS = (
 """The rays of X-Planes, for models that bring others."""
 
 
-@functools.cache
-def composed(*overrides):
-    return compose_plain("train", overrides)
+composed = functools.partial(changed, ())
 
 
 def test_a_baseline_brings_its_published_steps():

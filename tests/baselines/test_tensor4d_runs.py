@@ -25,6 +25,7 @@ def test_surface_run_learns_resumes_and_is_loaded(scenes, tmp_path, monkeypatch)
     assert not bool(trained.module.field.canonical_planes.blurred)
 
 
+@pytest.mark.slow
 def test_density_run_learns_and_is_loaded(scenes, tmp_path):
     config = baseline_config(
         scenes,

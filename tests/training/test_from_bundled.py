@@ -41,7 +41,7 @@ def test_the_default_initialisation_is_a_bundled_model():
     assert composed().lrm.name in bundled_models()
 
 
-@pytest.mark.parametrize("name", bundled_models())
+@pytest.mark.parametrize("name", ["tiny", pytest.param("mini", marks=pytest.mark.slow)])
 def test_it_knows_the_scene_before_the_first_step(train, random, tmp_path, name):
     informed = train(tmp_path / "run", f"lrm={name}")
     assert informed[0] > random[0] + 3

@@ -24,7 +24,7 @@ def settings(scenes: Path):
             f"preparation.cache={place}/cache",
             "preparation.frames=3",
             "preparation.fixed_view_seconds=1000",
-            "preparation.fixed_view_steps=12",
+            "preparation.fixed_view_steps=4",
             "trainer.max_steps=6",
             "callbacks.evaluation.at=[0]",
             *overrides,

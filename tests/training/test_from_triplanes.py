@@ -339,7 +339,7 @@ def test_an_unconverged_decomposition_warns_once(place, tmp_path, capfd):
 def test_triplanes_of_a_trained_field_initialise_a_field_with_equal_renders(place, tmp_path):
     """Checks end to end that orientation, time, decoder and frame of a file match the field's."""
     common = ("model=nine_planes", "model.precision=32")
-    config = small_config(place / "scenes", *common, "trainer.max_steps=80", UNSCORED)
+    config = small_config(place / "scenes", *common, "trainer.max_steps=30", UNSCORED)
     run(config, tmp_path / "first", [], resume=False)
     first = load_run(tmp_path / "first")
     field, options = first.module.field, first.experiment.method.model.decoder

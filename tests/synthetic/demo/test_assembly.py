@@ -187,6 +187,7 @@ def test_a_point_lands_in_its_pixel():
         assert centre == pytest.approx([column, row], abs=0.15), (azimuth, elevation)
 
 
+@pytest.mark.slow
 def test_scenes_stay_in_their_box_and_ball():
     origins, directions = rays(600, seed=5)
     for name, seed in product(DEMO_SCENES, (0, 4)):

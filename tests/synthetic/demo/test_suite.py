@@ -225,6 +225,7 @@ def test_captures_have_a_world_behind_and_masks_of_the_thing(name, tmp_path):
         assert 0.03 < (mask > 127).mean() < 0.5
 
 
+@pytest.mark.slow
 def test_masks_of_a_thing_cut_it_out_where_that_is_asked_for(tmp_path):
     folder = ("data=suite", f"data.root={tmp_path}", f"data.resolution={SIDE}",
               "data.train_views=2", "data.val_views=1", "data.test_views=1")  # fmt: skip

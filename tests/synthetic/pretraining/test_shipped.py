@@ -55,6 +55,7 @@ def test_a_dnerf_camera_is_its_own(models):
         assert found.frame.scale == pytest.approx(scale), name
 
 
+@pytest.mark.slow
 def test_it_reconstructs_held_out_objects(models, monkeypatch):
     monkeypatch.setattr(score_module, "GRID", 24)
     _, subject = held_out(2)

@@ -4,10 +4,22 @@ import math
 
 import torch
 
+from xplanes.scenes.batches import RaySettings
 from xplanes.scenes.cameras import PosedCamera, focal_length, look_at
 from xplanes.scenes.views import Scene, Views
 
 STATIC = torch.zeros(3)
+
+RAYS = RaySettings(
+    per_batch=64,
+    samples_per_batch=4096,
+    background="white",
+    skip_background=True,
+    background_share=0.1,
+    background_jitter=0.0,
+    error_share=0.0,
+)
+"""Rays of most tests of batches; what they need otherwise they replace."""
 
 
 def surrounding(count, distance, seed=0):

@@ -52,6 +52,7 @@ def train(monkeypatch, scenes: Path, tmp_path: Path):
     sys.modules.pop("total_time")
 
 
+@pytest.mark.slow
 def test_training_gets_what_the_preparation_leaves(train):
     budget = LONG + 10 * STEP
     seconds = train(f"{budget}")["seconds"]

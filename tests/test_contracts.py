@@ -170,11 +170,6 @@ def built(plain, scene):
 # conf/ and settings
 
 
-def test_there_is_something_to_test():
-    groups = {group for group, _ in OPTIONS}
-    assert groups == {*KINDS, "trainer", "callbacks", "logger", "recipe", "sweep", "experiment"}
-
-
 def test_every_option_is_composed():
     chosen = {tuple(text.split("=")) for overrides in COMPOSITIONS for text in overrides}
     assert chosen == set(OPTIONS)

@@ -18,6 +18,7 @@ from xplanes.training.module import RadianceModule
 FAST = (*KPLANES, "model.channels=8", "model.learning_rate=0.03")
 
 
+@pytest.mark.slow
 def test_hybrid_run_learns_resumes_and_is_loaded(scenes, tmp_path, monkeypatch):
     config = baseline_config(scenes, "model=kplanes", *FAST, *PROPOSAL, "trainer.max_steps=36")
     folder = check_learns(config, tmp_path / "whole", gain=3)

@@ -155,18 +155,6 @@ def near_of(rays):
     return torch.tensor([ray_box(o, d)[0] for o, d in zip(origins, directions, strict=True)])
 
 
-def test_rays_that_miss_have_no_samples_and_do_not_shift_the_others():
-    grid, rays = grid_of(filled=1.1), list(rays_of(9))
-    rays[0][::3] = torch.tensor([0.0, 0, 5]).double()
-    rays[1][::3] = torch.tensor([0.0, 0, 1]).double()
-    for found in (march(Rays(*rays), grid, step=STEP), twin(rays, grid)):
-        assert not set(found.ray.tolist()) & {0, 3, 6}
-        ends = [*found.starts.tolist()[1:], len(found)]
-        for ray, (start, end) in enumerate(zip(found.starts.tolist(), ends, strict=True)):
-            assert (found.ray[start:end] == ray).all()
-            assert (end == start) == (ray % 3 == 0)
-
-
 def test_impossible_rays_have_no_samples():
     for bad in [math.nan, math.inf, -math.inf]:
         grid, rays = grid_of(filled=1.1), list(rays_of(4))

@@ -35,14 +35,6 @@ def cells_of(grid, points, times):
     return ((time_bin * grid.resolution + z) * grid.resolution + y) * grid.resolution + x
 
 
-def test_all_cells_start_as_occupied():
-    grid = grid_of()
-    assert grid.occupied.all()
-    assert grid.allowed.all()
-    assert grid.occupied_fraction == 1
-    assert len(grid.density) == 2 * 4**3
-
-
 def presumed(*cells):
     """A grid of 2 x 4^3 cells of which all but these are presumed empty."""
     grid = grid_of()

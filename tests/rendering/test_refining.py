@@ -7,7 +7,7 @@ import torch
 from lightning import Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from tests.balls import ball_scene, surrounding
+from tests.balls import RAYS, ball_scene, surrounding
 from tests.training.runs import checkpoint, metrics, small_config
 from xplanes import RadianceModule
 from xplanes.errors import ConfigError
@@ -15,7 +15,7 @@ from xplanes.rendering import refining
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.refining import CameraCorrections, rotations, without_common
 from xplanes.run import run
-from xplanes.scenes.batches import RayBatches, RaySettings, ViewBatches, ViewSettings
+from xplanes.scenes.batches import RayBatches, ViewBatches, ViewSettings
 from xplanes.scenes.cameras import project
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.frame import CameraGroups, cube_frame
@@ -91,15 +91,7 @@ def apart(poses, truth):
 
 
 def batches_of(views, rays=2048):
-    settings = RaySettings(
-        per_batch=rays,
-        samples_per_batch=8192,
-        background="white",
-        skip_background=False,
-        background_share=1.0,
-        background_jitter=0.0,
-        error_share=0.0,
-    )
+    settings = replace(RAYS, per_batch=rays, skip_background=False, background_share=1.0)
     batches = RayBatches(views, FRAME, settings, seed=0)
     batches.add_slopes()
     return batches

@@ -7,10 +7,10 @@ from itertools import product
 import pytest
 import torch
 
-from tests.balls import ball_views
+from tests.balls import RAYS, ball_views
 from tests.oracles import project
 from xplanes.errors import ConfigError
-from xplanes.scenes.batches import NEAR_SILHOUETTE, RayBatches, RaySettings
+from xplanes.scenes.batches import NEAR_SILHOUETTE, RayBatches
 from xplanes.scenes.frame import Frame, cube_frame
 from xplanes.scenes.silhouettes import foreground, textureless
 from xplanes.streams import step_generator
@@ -21,19 +21,8 @@ VIEWS = replace(SQUARE, images=SQUARE.images[:, 4:20].contiguous(), intrinsics=F
 FRAME = cube_frame(1.4, torch.zeros(3))
 
 
-SETTINGS = RaySettings(
-    per_batch=64,
-    samples_per_batch=4096,
-    background="white",
-    skip_background=True,
-    background_share=0.1,
-    background_jitter=0.0,
-    error_share=0.0,
-)
-
-
 def batches_of(views=VIEWS, frame=FRAME, *, seed=0, rank=0, **options):
-    return RayBatches(views, frame, replace(SETTINGS, **options), seed=seed, rank=rank)
+    return RayBatches(views, frame, replace(RAYS, **options), seed=seed, rank=rank)
 
 
 def same(first, second):
@@ -262,15 +251,15 @@ def test_a_static_scene_has_no_other_times():
 
 def test_batches_of_open_size_follow_the_device():
     cpu, gpu = torch.device("cpu"), torch.device("cuda")
-    left_open = replace(SETTINGS, per_batch="auto", samples_per_batch="auto")
+    left_open = replace(RAYS, per_batch="auto", samples_per_batch="auto")
     assert (left_open.most, left_open.most_samples) == (1365, 8192)
     assert left_open.on(cpu) is left_open
     assert len(batches_of(per_batch="auto").draw(0)["times"]) == 1365
     large = left_open.on(gpu)
     assert (large.per_batch, large.samples_per_batch) == (32768, 524288)
     assert (large.fitting(256, 4096), left_open.fitting(256, 4096)) == (32768, 512)
-    assert SETTINGS.on(gpu) == SETTINGS
+    assert RAYS.on(gpu) == RAYS
     one_given = replace(left_open, per_batch=2048).on(gpu)
     assert (one_given.per_batch, one_given.samples_per_batch) == (2048, 524288)
     with pytest.raises(ConfigError, match="per_batch=many"):
-        replace(SETTINGS, per_batch="many")
+        replace(RAYS, per_batch="many")

@@ -588,8 +588,3 @@ def test_names_that_leave_the_folder(capture):
     for name in ("../../secret.png", str(capture.path.parent / "secret.png")):
         write_colmap(capture.path / "sparse/0", CAMERA, [(name, capture.poses[0], 1, 0)])
         capture.refused(r"images\.bin: .*secret\.png: (NAME leaves the scene's|no image)")
-
-
-def test_lenses_that_fold_back_inside_images(capture):
-    capture.write(cameras={1: ("SIMPLE_RADIAL", WIDTH, HEIGHT, (20.0, 20.0, 15.0, -0.9))})
-    capture.refused(r"frame_000\.png: its perspective lens with k1=-0\.9 folds back")

@@ -7,23 +7,16 @@ import pytest
 import torch
 from torch.utils.data import DistributedSampler
 
+from tests.balls import RAYS as WHITE
 from tests.balls import ball_scene
 from xplanes.errors import ConfigError
-from xplanes.scenes.batches import RayBatches, RaySettings
+from xplanes.scenes.batches import RayBatches
 from xplanes.scenes.datamodule import UNIFORM, SceneDataModule, spread_order
 from xplanes.scenes.frame import cube_frame, scene_frame
 from xplanes.scenes.listing import held_out_places
 
 FRAME = cube_frame(1.4, torch.zeros(3))
-RAYS = RaySettings(
-    per_batch=8,
-    samples_per_batch=4096,
-    background="random",
-    skip_background=True,
-    background_share=0.1,
-    background_jitter=0.0,
-    error_share=0.0,
-)
+RAYS = replace(WHITE, per_batch=8, background="random")
 
 
 def module_of(trained=0, rank=0):

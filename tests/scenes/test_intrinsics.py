@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.balls import RAYS as WHITE
 from tests.balls import ball_views, inside_ball, surrounding
 from tests.captures import settings
 from tests.refusals import assert_refused
@@ -19,7 +20,7 @@ from xplanes.preparation.fixed_view import check_camera
 from xplanes.rendering.carving import carve
 from xplanes.rendering.filling import fill
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.scenes.batches import RayBatches, RaySettings
+from xplanes.scenes.batches import RayBatches
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.scenes.frame import cube_frame, scene_frame
@@ -107,15 +108,7 @@ def opaque(views):
     return replace(views, images=images)
 
 
-RAYS = RaySettings(
-    per_batch=500,
-    samples_per_batch=4096,
-    background="random",
-    skip_background=True,
-    background_share=0.1,
-    background_jitter=0.0,
-    error_share=0.0,
-)
+RAYS = replace(WHITE, per_batch=500, background="random")
 
 
 # What views are

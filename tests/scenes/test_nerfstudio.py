@@ -21,7 +21,7 @@ from tests.refusals import assert_refused
 from xplanes.errors import MissingSplitError, SceneError
 from xplanes.scenes import store
 from xplanes.scenes.batches import RayBatches, ViewBatches, ViewSettings
-from xplanes.scenes.datamodule import UNIFORM, SceneDataModule, whole_view
+from xplanes.scenes.datamodule import UNIFORM, whole_view
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.nerfstudio import NerfstudioSettings
 from xplanes.scenes.views import joined
@@ -499,15 +499,6 @@ def test_what_is_no_capture(tmp_path):
         assert_refused(SceneError, words, read, name)
 
 
-def test_the_command_lines_settings_read_a_capture(capture):
-    capture.timed([0.1 * i for i in range(10)]).read()
-    options = (f"data.root={capture.path.parent}", "data.scene=ball", "data.resolution=12")
-    data = SceneDataModule.compose("data=nerfstudio", *options, "data.eval_every=4")
-    assert {name: len(views) for name, views in data.scene.splits.items()} == {"train": 8, "val": 2}
-    assert data.test_split == "val"
-    assert data.scene.splits["train"].outline == "12x12 px"
-
-
 def test_lenses_and_poses_of_many_cameras_stay_with_their_images(capture):
     """Views taken out, spread and held out keep the lens of their own frame."""
     for index, frame in enumerate(capture.frames):
@@ -640,14 +631,6 @@ def test_a_vertical_field_of_view_beside_a_focal_length(capture):
     assert intrinsics.centre[0].tolist() == [15, 10]
 
 
-def test_all_damaged_images_are_named(capture):
-    for index in (3, 7):
-        path = capture.path / capture.frames[index]["file_path"]
-        path.write_bytes(path.read_bytes()[:90])
-    message = capture.refused("frame_00003.png cannot be decoded", eval_every=100)
-    assert "frame_00007.png cannot be decoded" in message
-
-
 def test_images_elsewhere_or_one_folder_deeper(capture):
     expected = capture.read().splits["train"].files
     images, elsewhere = capture.path / "images", capture.path.parent / "elsewhere"
@@ -701,15 +684,6 @@ def test_a_link_to_nothing_is_a_missing_image(capture):
     path.symlink_to(capture.path.parent / "gone.png")
     with pytest.warns(UserWarning, match=r"1 of 10 frames are left out:(.|\n)*frame 3.*no image"):
         assert len(capture.read(eval_every=100).splits["train"]) == 9
-
-
-@pytest.mark.parametrize("name", ["spherical", "PANORAMA", "cylindrical"])
-def test_lenses_that_are_no_perspective_are_refused_wherever_they_stand(capture, name):
-    capture.frames[3]["camera_model"] = name
-    capture.refused(f"frame 3.*camera_model={name.upper()} is not a lens")
-    del capture.frames[3]["camera_model"]
-    capture.content["camera_model"] = name
-    capture.refused(f"json: camera_model={name.upper()} is not a lens")
 
 
 @pytest.mark.parametrize("name", ["pinhole_6", 2])

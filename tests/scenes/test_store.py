@@ -15,11 +15,12 @@ import torch
 from filelock import FileLock
 from PIL import Image
 
+from tests.balls import RAYS as NEAR
 from tests.balls import ball_views
 from xplanes.errors import SceneError
 from xplanes.files import DAY, MARK, StorageError
 from xplanes.scenes import store
-from xplanes.scenes.batches import AHEAD, RayBatches, RaySettings
+from xplanes.scenes.batches import AHEAD, RayBatches
 from xplanes.scenes.frame import cube_frame, scene_frame
 from xplanes.scenes.images import final_sizes, native_sizes
 from xplanes.scenes.images import read_images as read_sized
@@ -31,15 +32,7 @@ from xplanes.scenes.views import Views, joined
 from xplanes.streams import step_generator
 
 FRAME = cube_frame(1.4, torch.zeros(3))
-RAYS = RaySettings(
-    per_batch=1000,
-    samples_per_batch=8192,
-    background="white",
-    skip_background=False,
-    background_share=0.1,
-    background_jitter=0.0,
-    error_share=0.0,
-)
+RAYS = replace(NEAR, per_batch=1000, skip_background=False)
 
 
 def pictures(folder: Path, sizes, *, alpha: bool, seed=0) -> list[Path]:

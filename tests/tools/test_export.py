@@ -16,6 +16,7 @@ from torch import Tensor
 from tests.baselines.test_kplanes_field import products
 from tests.baselines.test_tensor4d_field import surface as tensor4d
 from tests.baselines.test_tineuvox_field import BOX
+from tests.tools.test_drawing import FRAME
 from xplanes.baselines.kplanes.field import HybridDecoder, KPlanes
 from xplanes.baselines.tensor4d.neus import NeusRenderer
 from xplanes.baselines.tineuvox.field import TiNeuVox
@@ -46,9 +47,6 @@ pytest.importorskip("skimage")
 
 ROOT = Path(__file__).resolve().parents[2]
 SIZE = 40
-
-TURN = torch.linalg.qr(torch.tensor([[1.0, 0.5, 0.2], [-0.3, 1.0, 0.4], [0.1, -0.6, 1.0]]))[0]
-FRAME = Frame(0.5, TURN * torch.linalg.det(TURN).sign(), torch.tensor([1.0, -2.0, 0.5]))
 
 
 class Ball(ViewDependentField):

@@ -203,7 +203,10 @@ def test_a_rig_takes_eight_pictures_at_once(name):
     assert torch.equal(poses[:42], poses[8:])
 
 
-@pytest.mark.parametrize("name", [*both("phone"), *both("rig")])
+LATER = [pytest.param(name, marks=pytest.mark.slow) for name in ("phone_test", "rig_test")]
+
+
+@pytest.mark.parametrize("name", ["phone", "rig", *LATER])
 def test_captures_have_a_world_behind_and_masks_of_the_thing(name, tmp_path):
     counts = {"train_views": 3, "val_views": 1, "test_views": 2}
     folder = ensure_suite_scene(tmp_path, name, resolution=SIDE, **counts, announce=lambda _: None)

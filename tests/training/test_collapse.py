@@ -3,6 +3,8 @@
 import csv
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -19,6 +21,7 @@ from xplanes.training.meters import mean_opacities
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import blank_psnr, floaters, psnr_foreground
 
+FOGGY = {"foreground": 0.9, "background": 0.8}
 QUICK = ("trainer.max_steps=24", "callbacks.evaluation.at=[]", "callbacks.checkpoints.every=14")
 
 
@@ -74,6 +77,16 @@ def test_a_verdict_needs_rays_that_tell():
     assert verdict([(0.9, 0.8)], fog=False) == ""
     with pytest.raises(ConfigError, match=r"restarts=-1"):
         CollapseWatch(restarts=-1)
+
+
+def test_fog_has_time_to_clear_by_itself(monkeypatch):
+    monkeypatch.setattr(collapse, "WINDOW", 1)
+    watch, module = CollapseWatch(restarts=0), Mock(spec=RadianceModule)
+    module.tally, module.between_updates = SimpleNamespace(last=FOGGY), True
+    for step, foggy in ((collapse.FIRST_FOG, False), (collapse.FIRST_FOG + 1, True)):
+        trainer = SimpleNamespace(global_step=step, world_size=1)
+        watch.on_train_batch_end(trainer, module, None, None, 0)
+        assert ("fog" in watch.collapsed) == foggy, step
 
 
 @pytest.fixture

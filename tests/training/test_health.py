@@ -14,6 +14,7 @@ from torch import nn
 
 from tests.training.runs import checkpoint, metrics, small_config, status
 from xplanes.errors import ConfigError
+from xplanes.files import read_rows
 from xplanes.models.base import LossTerm
 from xplanes.models.x_planes import XPlanesModel
 from xplanes.run import run
@@ -301,3 +302,5 @@ def test_a_damaged_record_does_not_end_a_run(scenes, folder, caplog):
     assert "record of this run starts again" in caplog.text
     record = status(folder)
     assert (record["status"], record["resumed"]) == ("finished", 1)
+    # What was evaluated again stands in the curve once.
+    assert [row["step"] for row in read_rows(folder / "curve.csv")] == ["5", "12"]

@@ -33,6 +33,7 @@ def both(names, dtype, *, channels, count, sizes=(3, 4, 5), reach=1.3):
     return results
 
 
+@pytest.mark.slow
 def test_values_and_gradients_are_the_twins():
     for names, channels, count in [
         (DYNAMIC, 1, 9),

@@ -162,7 +162,10 @@ def every_renderer() -> dict[str, tuple[Any, RayRenderer]]:
     }
 
 
-@pytest.mark.parametrize("name", ["occupancy", "proposal", "fixed step", "neus"])
+NEUS = pytest.param("neus", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("name", ["occupancy", "proposal", "fixed step", NEUS])
 def test_every_renderer_crops(name):
     field, renderer = every_renderer()[name]
     everything = torch.tensor([[-9.0] * 3, [9.0] * 3])

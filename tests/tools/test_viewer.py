@@ -273,7 +273,9 @@ def fitted(name: str, folder: Path, *callbacks: Callback, steps: int = 12) -> Ra
     return found
 
 
-@pytest.mark.parametrize("name", ["six_planes with a background", "kplanes"])
+@pytest.mark.parametrize(
+    "name", ["six_planes with a background", pytest.param("kplanes", marks=pytest.mark.slow)]
+)
 def test_training_is_the_same_with_a_viewer_to_the_last_bit(name, tmp_path, watched):
     plain = fitted(name, tmp_path)
     assert not watched

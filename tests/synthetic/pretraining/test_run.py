@@ -45,6 +45,7 @@ def state(run):
     return torch.load(run / CHECKPOINT, weights_only=True)
 
 
+@pytest.mark.slow
 def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, pool_folder, monkeypatch, capsys):
     steps = "schedule.max_steps=6"
     assert command(tmp_path / "whole", pool_folder, steps) == 0

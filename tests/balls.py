@@ -18,6 +18,7 @@ RAYS = RaySettings(
     background_share=0.1,
     background_jitter=0.0,
     error_share=0.0,
+    match_exposure=False,
 )
 """Rays of most tests of batches; what they need otherwise they replace."""
 

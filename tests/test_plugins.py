@@ -75,7 +75,12 @@ def test_a_recipe_reaches_a_model_of_ones_own_or_names_itself(tmp_path):
     group.mkdir()
     rays = dict.fromkeys(("per_batch", "samples_per_batch"), "auto")
     rays |= {"background": "white", "skip_background": False}
-    rays |= {"background_share": 0.2, "background_jitter": 0.05, "error_share": 0.0}
+    rays |= {
+        "background_share": 0.2,
+        "background_jitter": 0.05,
+        "error_share": 0.0,
+        "match_exposure": False,
+    }
     defaults = [{"sampler": "proposal"}, {"/lrm@_global_.lrm": "none"}, "_self_"]
     (group / "blob.yaml").write_text(yaml.safe_dump({"defaults": defaults, **BLOB, "rays": rays}))
     own = [f"hydra.searchpath=[file://{tmp_path}]", "plugins=[tests.plugins]", "model=blob"]

@@ -94,10 +94,12 @@ def test_a_world_gets_a_background_and_the_planes_are_initialised_as_ever():
         if name == "field.decoder.layers.3.bias":  # No colour that nears a white background.
             value = value - torch.tensor([0.0, 1.0, 1.0, 1.0])
         torch.testing.assert_close(value, with_.state_dict()[name])
-    groups = {group["name"]: group["params"] for group in with_.model.groups()}
-    listed = [id(p) for params in groups.values() for p in params]
+    groups = [*with_.model.groups(), *with_.sampler.groups()]
+    listed = [id(p) for group in groups for p in group["params"]]
     assert sorted(listed) == sorted(id(p) for p in with_.parameters())
-    assert set(terms(with_, "world")) == {"colour", "passing", "distortion", "unseen"}
+    assert set(terms(with_, "world")) == {
+        "colour", "passing", "distortion", "unseen", "exposures",
+    }  # fmt: skip
 
 
 def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():
@@ -132,7 +134,10 @@ def test_few_views_are_scored_before_surroundings_and_none_soon_after_the_first_
 @pytest.mark.parametrize("kind", ["world", "white"])
 def test_before_a_background_planes_are_less_smooth_in_time_and_cells_stay_longer(kind):
     module = built(
-        kind, "model.sampler.sweep_at=[20,40]", "model.loss.time_factor_with_background=0.25"
+        kind,
+        "model.sampler.sweep_at=[20,40]",
+        "model.loss.time_factor_with_background=0.25",
+        "model.rays.match_exposure=false",
     )
     loss, world = module.model.settings.loss, kind == "world"
     used = module.model.weights

@@ -17,8 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor, distributed, nn
 
-from xplanes.rendering.base import Renderer, Rendering
-from xplanes.rendering.sampler import Group, Sampler
+from xplanes.rendering.base import Rendering
+from xplanes.rendering.sampler import Sampler, WrappingSampler
 from xplanes.scenes.batches import Batch
 from xplanes.scenes.frame import CameraGroups, Frame
 from xplanes.streams import TrainingState
@@ -48,7 +48,7 @@ BEHIND = 3.0
 """Assumed distance of surroundings from the centre of the cube, in halves of its side."""
 
 
-class RefiningSampler(Sampler):
+class RefiningSampler(WrappingSampler):
     """Another sampler of rays, with poses that are corrected.
 
     Args:
@@ -58,14 +58,10 @@ class RefiningSampler(Sampler):
     """
 
     def __init__(self, inner: Sampler, groups: CameraGroups, scale: float = 1.0) -> None:
-        self.inner, self.fill_seconds = inner, inner.fill_seconds
+        super().__init__(inner)
         self.cameras = CameraCorrections(groups)
         self.every, self.first = (max(1, round(count / scale)) for count in (EVERY, FIRST))
         self._seen: Batch | None = None
-
-    @property
-    def renderer(self) -> Renderer:
-        return self.inner.renderer
 
     @property
     def parts(self) -> dict[str, nn.Module]:
@@ -75,29 +71,10 @@ class RefiningSampler(Sampler):
     def outline(self) -> str:
         return f"{self.inner.outline}, cameras refined".removeprefix(", ")
 
-    def groups(self) -> list[Group]:
-        return self.inner.groups()
-
-    @property
-    def pruned_at(self) -> int:
-        return self.inner.pruned_at
-
-    def first_rays(self, most: int) -> int:
-        return self.inner.first_rays(most)
-
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
         rays = self.cameras.corrected(rays)
         self._seen = rays if state.step >= self.first - self.every else None
         return self.inner.render(field, rays, state)
-
-    def losses(self, rendering: Any) -> dict[str, Tensor]:
-        return self.inner.losses(rendering)
-
-    def regularise(self, field: Any, state: TrainingState) -> None:
-        self.inner.regularise(field, state)
-
-    def regularisers(self, field: Any, state: TrainingState) -> dict[str, float]:
-        return self.inner.regularisers(field, state)
 
     def observe(self, rendering: Any) -> None:
         if self._seen is not None:
@@ -110,9 +87,6 @@ class RefiningSampler(Sampler):
         done = state.step + 1
         if done >= self.first and done % self.every == 0:
             self.cameras.solve()
-
-    def expect(self, samples: float) -> None:
-        self.inner.expect(samples)
 
     def scalars(self) -> dict[str, float]:
         moved = float(self.cameras.moved.mean())

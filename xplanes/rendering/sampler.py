@@ -51,6 +51,7 @@ class Site:
         surrounded: Whether the training images show surroundings, which lie behind the field's
             cube.
         cameras: Training cameras whose poses are refined; None if they are taken as exact.
+        exposed: Training cameras whose exposures are matched; None if they are taken as equal.
         device: Device on which the field will be trained; the CPU when None.
         samples_per_batch: Maximum average number of samples per training batch; None if unknown.
         batch_scale: Batch size relative to the one that schedules assume, see `steps`.
@@ -66,6 +67,7 @@ class Site:
     pixels: float = 0.0
     surrounded: bool = False
     cameras: CameraGroups | None = None
+    exposed: CameraGroups | None = None
     device: torch.device | None = None
     samples_per_batch: int | None = None
     batch_scale: float = 1.0
@@ -183,6 +185,63 @@ class Sampler(ABC):
     def scalars(self) -> dict[str, float]:
         """Values for the logger, by name."""
         return {}
+
+
+class WrappingSampler(Sampler):
+    """Base class of samplers that change what another one renders.
+
+    Args:
+        inner: The other sampler; what a derived class does not override is left to it.
+    """
+
+    def __init__(self, inner: Sampler) -> None:
+        self.inner, self.fill_seconds = inner, inner.fill_seconds
+
+    @property
+    def renderer(self) -> Renderer:
+        return self.inner.renderer
+
+    @property
+    def parts(self) -> dict[str, nn.Module]:
+        return self.inner.parts
+
+    @property
+    def outline(self) -> str:
+        return self.inner.outline
+
+    def groups(self) -> list[Group]:
+        return self.inner.groups()
+
+    @property
+    def pruned_at(self) -> int:
+        return self.inner.pruned_at
+
+    def first_rays(self, most: int) -> int:
+        return self.inner.first_rays(most)
+
+    def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
+        return self.inner.render(field, rays, state)
+
+    def losses(self, rendering: Any) -> dict[str, Tensor]:
+        return self.inner.losses(rendering)
+
+    def regularise(self, field: Any, state: TrainingState) -> None:
+        self.inner.regularise(field, state)
+
+    def regularisers(self, field: Any, state: TrainingState) -> dict[str, float]:
+        return self.inner.regularisers(field, state)
+
+    def observe(self, rendering: Any) -> None:
+        self.inner.observe(rendering)
+
+    def update(self, field: Any, state: TrainingState) -> None:
+        self.inner.update(field, state)
+
+    def expect(self, samples: float) -> None:
+        self.inner.expect(samples)
+
+    def scalars(self) -> dict[str, float]:
+        return self.inner.scalars()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -97,6 +97,11 @@ class BatchSettings(Settings, ABC):
         return self
 
     @property
+    def matches_exposure(self) -> bool:
+        """Whether a gain of each training camera is learnt, where images show surroundings."""
+        return False
+
+    @property
     @abstractmethod
     def most(self) -> int:
         """Maximum rays per batch; 0 if a batch is a whole view."""
@@ -139,6 +144,8 @@ class RaySettings(BatchSettings):
     # Share of rays that are drawn in proportion to the error of the field where their pixels lie.
     # Weights in the loss make up for it. For images in memory; 0: none.
     error_share: Share
+    # Learn a gain per colour channel of each training camera, if the images show surroundings.
+    match_exposure: bool
 
     def on(self, device: torch.device) -> "RaySettings":
         if device.type == "cpu":
@@ -146,6 +153,10 @@ class RaySettings(BatchSettings):
         rays = GPU_RAYS if self.per_batch == "auto" else self.per_batch
         samples = GPU_SAMPLES if self.samples_per_batch == "auto" else self.samples_per_batch
         return replace(self, per_batch=rays, samples_per_batch=samples)
+
+    @property
+    def matches_exposure(self) -> bool:
+        return self.match_exposure
 
     @property
     def most(self) -> int:
@@ -315,9 +326,10 @@ class RayBatches(Batches):
 
         Returns:
             ``origins`` and unit ``directions`` in the field's frame [R, 3], ``times`` [R],
-            ``target`` colour on ``background`` [R, 3] each, its ``alpha`` [R], and ``jitter``
-            from 0 to 1 [R]. With `tiles`, also ``tile``, the number of each pixel's tile, int64
-            [R], and with ``errors`` the rays' ``weight`` in the loss [R]. More with `slopes`.
+            ``target`` colour on ``background`` [R, 3] each, its ``alpha`` [R], ``jitter`` from 0
+            to 1 [R], and its ``view``, int64 [R]. With `tiles`, also ``tile``, the number of each
+            pixel's tile, int64 [R], and with ``errors`` the rays' ``weight`` in the loss [R]. More
+            with `slopes`.
         """
         rays = rays or self.rays
         errors = None if self.tiles is None else errors
@@ -351,6 +363,7 @@ class RayBatches(Batches):
         colour = colour.float() / 255
         more = self._slopes(directions, view, row, column, background) if self.slopes else {}
         return more | {
+            "view": view,
             "origins": origins,
             "directions": directions,
             "times": self._times(view, far & (colour[:, 3] == 0), move),
@@ -381,7 +394,7 @@ class RayBatches(Batches):
         slopes = torch.einsum("rijc,kij->rck", around, kernels)
         # Images are stored multiplied by alpha.
         slopes = slopes[:, :3] - background[..., None] * slopes[:, 3:]
-        return {"view": view, "across": across, "slopes": slopes}
+        return {"across": across, "slopes": slopes}
 
     def _from_memory(
         self, images: Tensor, uniform: Tensor, rays: int, errors: Tensor | None

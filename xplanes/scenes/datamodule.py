@@ -30,6 +30,7 @@ UNIFORM = RaySettings(
     background_share=1.0,
     background_jitter=0.0,
     error_share=0.0,
+    match_exposure=False,
 )
 """Batches for a LightningModule that does not specify any."""
 

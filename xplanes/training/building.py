@@ -13,6 +13,8 @@ from xplanes.errors import ConfigError
 from xplanes.fields.base import Representation
 from xplanes.models.base import Model, ModelSettings
 from xplanes.models.initialisation import Initialisation, Method, Place, initialisation_of
+from xplanes.rendering.exposure import START as EXPOSURE_START
+from xplanes.rendering.exposure import ExposureSampler
 from xplanes.rendering.refining import RefiningSampler
 from xplanes.rendering.sampler import Sampler, Site
 from xplanes.scenes.frame import (
@@ -75,6 +77,8 @@ class Parts:
             )
         settings.sampler.require_kind(type(field))
         sampler = settings.sampler.build(field, site)
+        if site.exposed is not None:
+            sampler = ExposureSampler(sampler, site.exposed, site.steps(EXPOSURE_START))
         if site.cameras is not None:
             sampler = RefiningSampler(sampler, site.cameras, site.batch_scale)
         require_groups(model, sampler)
@@ -126,6 +130,7 @@ def build_parts(
         place = Place(scene, frame, device, devices, say, hints)
         found = initialisation_of(method, method.lrm.load(say), place)
     resolved = rays.on(device)
+    cameras = CameraGroups.of(views, found.frame)
     site = Site(
         frame=found.frame,
         # For a field without time planes all views have the same time.
@@ -137,7 +142,8 @@ def build_parts(
         initialised=found.values is not None,
         pixels=pixels_of_detail(views, found.frame, scene.is_surrounded),
         surrounded=scene.is_surrounded,
-        cameras=CameraGroups.of(views, found.frame) if scene.refine_cameras else None,
+        cameras=cameras if scene.refine_cameras else None,
+        exposed=cameras if rays.matches_exposure and scene.is_surrounded else None,
         device=device,
         samples_per_batch=resolved.most_samples,
         batch_scale=resolved.most / rays.most if rays.most else 1.0,
@@ -160,6 +166,7 @@ def site_content(parts: Parts) -> dict[str, Any]:
         "pixels": site.pixels,
         "surrounded": site.surrounded,
         "cameras": None if site.cameras is None else vars(site.cameras),
+        "exposed": None if site.exposed is None else vars(site.exposed),
     }
 
 
@@ -181,7 +188,10 @@ def parts_from(
         settings = build(content["model"], ModelSettings, "model")
     if not content["initialised"] or settings.name != method.model.name:
         settings = method.model  # If it is another model, loading its weights will fail.
-    cameras = content.get("cameras")
+    cameras, exposed = (
+        None if (groups := content.get(name)) is None else CameraGroups(**groups)
+        for name in ("cameras", "exposed")
+    )
     site = Site(
         frame=read_frame(content["frame"], "the checkpoint"),
         times=content["times"],
@@ -190,7 +200,8 @@ def parts_from(
         bounds=content["bounds"],
         pixels=content["pixels"],
         surrounded=content["surrounded"],
-        cameras=None if cameras is None else CameraGroups(**cameras),
+        cameras=cameras,
+        exposed=exposed,
         samples_per_batch=samples,
     )
     return Parts.assemble(settings, site)

@@ -1,0 +1,88 @@
+"""Exposures of training cameras that differ: a gain per colour channel of each, learnt in training.
+
+Cameras choose exposure and white balance for each photo, and those of a rig are not alike. A field
+that must agree with all of them turns the differences into fog or blurs texture. Images are
+rendered with the mean exposure of the training cameras.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from xplanes.rendering.base import Rendering
+from xplanes.rendering.sampler import Group, Sampler, WrappingSampler
+from xplanes.scenes.batches import Batch
+from xplanes.scenes.frame import CameraGroups
+from xplanes.streams import TrainingState
+
+START = 300
+"""Step from which exposures are matched: until then the field is too dark or too pale."""
+
+RATE, PULL = 0.01, 0.003
+"""Learning rate of the gains' logarithms, and weight of their mean square in the loss."""
+
+
+class ExposureSampler(WrappingSampler):
+    """Another sampler of rays, whose colours are multiplied by a gain of the ray's camera.
+
+    Args:
+        inner: The sampler.
+        groups: The training cameras.
+        start: Step from which exposures are matched.
+    """
+
+    def __init__(self, inner: Sampler, groups: CameraGroups, start: int = START) -> None:
+        super().__init__(inner)
+        self.exposures, self.start = Exposures(groups), start
+
+    @property
+    def parts(self) -> dict[str, nn.Module]:
+        return self.inner.parts | {"exposures": self.exposures}
+
+    def groups(self) -> list[Group]:
+        gains: Group = {"params": [self.exposures.logarithms], "lr": RATE, "name": "exposures"}
+        return [*self.inner.groups(), gains]
+
+    def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
+        rendering = self.inner.render(field, rays, state)
+        if state.step < self.start:
+            return rendering
+        return replace(rendering, colour=rendering.colour * self.exposures(rays["view"]))
+
+    def losses(self, rendering: Any) -> dict[str, Tensor]:
+        pull = PULL * self.exposures.relative.square().mean()
+        return self.inner.losses(rendering) | {"exposures": pull}
+
+    def scalars(self) -> dict[str, float]:
+        spread = float(self.exposures.relative.detach().square().mean().sqrt())
+        return self.inner.scalars() | {"sampler/exposures_spread": spread}
+
+
+class Exposures(nn.Module):
+    """A gain per colour channel of each camera; their geometric mean is 1.
+
+    Args:
+        groups: The training cameras.
+
+    Attributes:
+        logarithms: Logarithms of the gains, up to a common one. [C, 3]
+    """
+
+    index: Tensor
+
+    def __init__(self, groups: CameraGroups) -> None:
+        super().__init__()
+        # Known wherever the field is built.
+        self.register_buffer("index", groups.index, persistent=False)
+        self.logarithms = nn.Parameter(torch.zeros(len(groups.places), 3))
+
+    @property
+    def relative(self) -> Tensor:
+        """Logarithms of the gains. [C, 3]"""
+        return self.logarithms - self.logarithms.mean(dim=0)
+
+    def forward(self, view: Tensor) -> Tensor:
+        """Gains of rays by their training views. int64 [R] -> [R, 3]"""
+        return self.relative[self.index[view]].exp()

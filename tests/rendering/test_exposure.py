@@ -1,7 +1,6 @@
 """Exposures of cameras: gains that are learnt, used in training alone, and stored."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,6 +12,7 @@ from xplanes.rendering.base import Rendering
 from xplanes.rendering.exposure import ExposureSampler
 from xplanes.rendering.sampler import Sampler
 from xplanes.scenes.frame import CameraGroups
+from xplanes.streams import TrainingState
 from xplanes.training import building
 
 GAINS = torch.tensor([[0.8, 1.0, 1.1], [1.25, 1.0, 1.0], [1.0, 1.0, 1 / 1.1]])
@@ -43,7 +43,7 @@ def test_gains_of_cameras_are_found_and_their_mean_is_one():
     (group,) = sampler.groups()
     optimizer = torch.optim.Adam([*group["params"], inner.colour], lr=0.01)
     for step in range(400):
-        rendering = sampler.render(None, rays, SimpleNamespace(step=step))
+        rendering = sampler.render(None, rays, TrainingState(0, step, step, 0))
         assert (rendering.colour is inner.colour) == (step < 5)
         # What the cameras see is the same.
         same = (inner.colour - inner.colour.mean(dim=0)).square().sum()
@@ -77,6 +77,7 @@ def test_photos_of_different_exposure_are_told_apart(monkeypatch, tmp_path):
     monkeypatch.setattr(building, "EXPOSURE_START", 20)
     given, dark = scene("world"), torch.arange(12) % 2 == 0
     views = given.splits["train"]
+    assert isinstance(views.images, torch.Tensor)
     images = views.images.clone()
     images[dark, ..., :3] = (images[dark, ..., :3] * 0.7).to(torch.uint8)
     photos = replace(given, splits=given.splits | {"train": replace(views, images=images)})

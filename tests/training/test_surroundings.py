@@ -131,6 +131,18 @@ def test_few_views_are_scored_before_surroundings_and_none_soon_after_the_first_
         assert affordable(at, limit, surrounded) == (at, limit)
 
 
+@pytest.mark.parametrize(("kind", "factor"), [("world", 2), ("white", 1)])
+def test_before_a_background_rays_have_half_the_samples_until_the_grid_is_pruned(kind, factor):
+    module = built(kind, "model.sampler.sweep_at=[20,40]", "model.sampler.sweep_every=50")
+    batch, _ = rendered(module, kind)
+    first, last, after = (
+        module.sampler.render(module.field, batch, replace(module.state, step=step)).samples
+        for step in (0, 39, 40)
+    )
+    assert last.candidates == first.candidates
+    assert after.candidates / last.candidates == pytest.approx(factor, rel=0.05)
+
+
 @pytest.mark.parametrize("kind", ["world", "white"])
 def test_before_a_background_planes_are_less_smooth_in_time_and_cells_stay_longer(kind):
     module = built(

@@ -211,6 +211,9 @@ class OccupancySettings(SamplerSettings):
     # which would take over the content of cells that are emptied too early.
     sweep_at: list[int]
     sweep_every: Count  # Steps between updates of all occupied cells afterwards.
+    # Half as many samples along rays before the first of these updates, if a background is learnt:
+    # all cells may be occupied until then.
+    coarse_first: bool
     update_every: Count  # Steps between updates of random cells.
     update_cells: Count  # Maximum number of cells per update.
 
@@ -267,6 +270,7 @@ class OccupancySettings(SamplerSettings):
             sweep_at=[site.steps(step) for step in self.sweep_at],
             sweep_every=site.steps(self.sweep_every),
             distortion=0.0,
+            coarse_first=False,
         )
 
     def with_learnt_background(self) -> "OccupancySettings":
@@ -345,10 +349,13 @@ class OccupancySampler(Sampler):
         return min(most, 256)
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
+        training = self._training
+        if self.settings.coarse_first and state.step < self.pruned_at:
+            training = replace(training, samples=training.samples // 2)
         # On other devices the selection costs more than it saves.
         thins = self.settings.thinning > 0 and self.device.type == "cpu"
         thins = thins and torch.is_grad_enabled() and isinstance(field, nn.Module)
-        return self._training.render(
+        return training.render(
             field,
             rays["origins"],
             rays["directions"],

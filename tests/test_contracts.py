@@ -226,8 +226,7 @@ def test_a_static_scene_gets_no_time_planes(moving):
         module, _ = built(plain, scene)
         assert module.field.moves == moving, name
         if hasattr(module, "grid"):
-            bins = plain["model"]["sampler"]["time_bins"]
-            assert module.grid.time_bins == (bins if moving else 1), name
+            assert module.grid.time_bins == (8 if moving else 1), name
 
 
 def test_equal_seeds_build_equal_fields_and_zero_is_a_seed():

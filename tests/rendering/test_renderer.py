@@ -239,7 +239,7 @@ def test_random_points_of_occupied_cells_pay_for_their_opacity():
 def test_fog_before_a_background_pays_for_its_distortion():
     options = compose_plain("train", [])["model"]["sampler"]
     known = {key: value for key, value in options.items() if key != "_target_"}
-    settings = OccupancySettings(**known | {"distortion": 0.5})
+    settings = OccupancySettings(**known | {"distortion": 0.5, "coarse_first": False})
     batch = dict(zip(("origins", "directions", "times"), rays_of(8), strict=True))
     batch |= {"background": WHITE.expand(8, 3), "jitter": batch["times"]}
     state = TrainingState(0, 1, 1, 0)
@@ -268,3 +268,23 @@ def test_points_of_occupied_cells_lie_in_all_of_them_and_in_no_others():
     uniform = torch.rand(4000, 5, generator=torch.Generator().manual_seed(1))
     cells = grid.cells(*grid.occupied_points(uniform))
     assert torch.equal(cells.unique(), chosen.nonzero()[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("views", "timesteps", "given", "bins"),
+    [
+        (50, 50, "auto", 8),
+        (45, 15, "auto", 8),  # Three views show each timestep.
+        (60, 15, "auto", 15),
+        (400, 100, "auto", 16),
+        (20, 5, "auto", 8),
+        (60, 15, 4, 4),
+        (9, 1, "auto", 1),
+        (9, 1, 4, 1),
+    ],
+)
+def test_bins_along_time_follow_timesteps_that_several_views_show(views, timesteps, given, bins):
+    known = compose_plain("train", [])["model"]["sampler"]
+    known = {name: value for name, value in known.items() if name != "_target_"}
+    settings = OccupancySettings(**known | {"time_bins": given})
+    assert settings.bins(torch.linspace(0, 1, timesteps).repeat(views // timesteps)) == bins

@@ -20,7 +20,7 @@ from xplanes.rendering.filling import fill
 from xplanes.rendering.front_to_back import front_to_back
 from xplanes.rendering.marching import Rays, march
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
+from xplanes.rendering.sampler import VIEWS_PER_ROW, Sampler, SamplerSettings, Site
 from xplanes.rendering.thinning import thinned
 from xplanes.rendering.warming import render_one_ray
 from xplanes.scenes.batches import Batch
@@ -35,6 +35,9 @@ STEP_OF_ROOM = 1024
 
 FEWEST_SAMPLES, SAMPLES_PER_PIXEL = 128, 0.5
 """Samples along the diagonal: at least, and per image pixel along the cube's side."""
+
+BINS, MOST_BINS = 8, 16
+"""Bins of the grid along time with time_bins=auto: usually, and at most."""
 
 SPARSE_POINTS = 2048
 """Points at which the sparsity prior is evaluated."""
@@ -189,7 +192,9 @@ class OccupancySettings(SamplerSettings):
     samples: Count | Literal["auto"]
     render_samples: Count  # Samples along the diagonal in evaluation and videos.
     grid_resolution: Count  # Cells of the occupancy grid along each side.
-    time_bins: Count  # Bins of the occupancy grid along time.
+    # Bins of the occupancy grid along time. auto: 8; one per timestep, up to 16, if four or more
+    # views show each.
+    time_bins: Count | Literal["auto"]
     threshold: Fraction  # Opacity per step below which a cell is empty.
     # Replaces `model.sampler.threshold` if a background is learnt.
     threshold_with_background: Fraction
@@ -223,11 +228,26 @@ class OccupancySettings(SamplerSettings):
                 f"occlusion={self.occlusion}: must be below 1, or all samples are skipped; 0.001 "
                 "is the default, skip_occluded=false skips none"
             )
-        if self.grid_resolution**3 * self.time_bins > 2**28:
+        bins = MOST_BINS if self.time_bins == "auto" else self.time_bins
+        if self.grid_resolution**3 * bins > 2**28:
             raise ConfigError(
-                f"grid_resolution={self.grid_resolution} with time_bins={self.time_bins}: more "
+                f"grid_resolution={self.grid_resolution} with time_bins={bins}: more "
                 "than 268 million cells; lower one of them"
             )
+
+    def bins(self, times: Tensor) -> int:
+        """Bins of the grid along time.
+
+        Args:
+            times: Times of the training views. [V]
+        """
+        distinct = len(times.unique())
+        if distinct == 1:
+            return 1
+        if self.time_bins != "auto":
+            return self.time_bins
+        determined = len(times) >= VIEWS_PER_ROW * distinct
+        return min(max(distinct, BINS), MOST_BINS) if determined else BINS
 
     def build(self, field: RadianceField, site: Site) -> "OccupancySampler":
         constant = getattr(field, "background", None) is None
@@ -238,7 +258,7 @@ class OccupancySettings(SamplerSettings):
         along = self.samples
         grid = OccupancyGrid(
             self.grid_resolution,
-            self.time_bins if site.moves else 1,
+            self.bins(site.times),
             step=DIAGONAL / along,
             threshold=self.threshold if constant else self.threshold_with_background,
             decay=self.decay,

@@ -155,6 +155,7 @@ def test_before_a_background_planes_are_less_smooth_in_time_and_cells_stay_longe
     used = module.model.weights
     for name in ("time_variation", "time_smoothness", "time_magnitude"):
         assert getattr(used, name) == getattr(loss, name) * (0.25 if world else 1)
+    assert module.grid.decay == (0.9 if world else 0.6)
     if world:
         assert module.sampler.settings.sweep_at == [40]
     else:

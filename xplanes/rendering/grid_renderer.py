@@ -199,6 +199,9 @@ class OccupancySettings(SamplerSettings):
     # Replaces `model.sampler.threshold` if a background is learnt.
     threshold_with_background: Fraction
     decay: Share  # Decay of a cell's density at each update.
+    # Replaces `model.sampler.decay` if a background is learnt. Most observations of a cell that
+    # something thin crosses lie beside it.
+    decay_with_background: Share
     skip_empty: bool  # Skip samples in empty cells.
     skip_occluded: bool  # Skip samples behind opaque surfaces.
     occlusion: Annotated[float, Range(0, 1)]  # Transmittance below which samples are occluded.
@@ -261,7 +264,7 @@ class OccupancySettings(SamplerSettings):
             self.bins(site.times),
             step=DIAGONAL / along,
             threshold=self.threshold if constant else self.threshold_with_background,
-            decay=self.decay,
+            decay=self.decay if constant else self.decay_with_background,
         )
         renderer = GridRenderer(
             grid,

@@ -219,8 +219,8 @@ class OccupancySettings(SamplerSettings):
     # which would take over the content of cells that are emptied too early.
     sweep_at: list[int]
     sweep_every: Count  # Steps between updates of all occupied cells afterwards.
-    # Half as many samples along rays before the first of these updates, if a background is learnt:
-    # all cells may be occupied until then.
+    # Half as many samples along rays before the first of these updates: all cells may be occupied
+    # until then.
     coarse_first: bool
     update_every: Count  # Steps between updates of random cells.
     update_cells: Count  # Maximum number of cells per update.
@@ -293,7 +293,6 @@ class OccupancySettings(SamplerSettings):
             sweep_at=[site.steps(step) for step in self.sweep_at],
             sweep_every=site.steps(self.sweep_every),
             distortion=0.0,
-            coarse_first=False,
         )
 
     def with_learnt_background(self) -> "OccupancySettings":

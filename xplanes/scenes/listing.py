@@ -188,9 +188,13 @@ def time_source(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
         files: Names of the images. [V]
         times: Their times as given. [V]
     """
+    first, last, *known = (
+        f"{time:.6g}" if isinstance(time, float) else str(time)
+        for time in (min(times), max(times), *times)
+    )
     shown = dict.fromkeys(spread(min(len(files), 3), len(files)))
-    examples = ", ".join(f"{files[rank]} -> {times[rank]}" for rank in shown)
-    return f"{origin}, from {min(times)} to {max(times)}: {examples}"
+    examples = ", ".join(f"{files[rank]} -> {known[rank]}" for rank in shown)
+    return f"{origin}, from {first} to {last}: {examples}"
 
 
 def held_out_places(times: Sequence[float], every: int) -> list[int]:

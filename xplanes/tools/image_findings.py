@@ -169,8 +169,9 @@ def texel_findings(per_texel: float, native: int, wide: int, resolution: int) ->
         yield Finding(
             "texels",
             f"a texel of planes with {resolution} texels per side covers {per_texel:.0f} pixels of "
-            f"images {wide} pixels wide. Set data.resolution={width}, which loses no detail "
-            f"that the planes could represent, or give the planes {finer} texels per side",
+            f"images {wide} pixels wide. model.fine.texels={finer} adds finer planes, which pay "
+            f"from two minutes of training on; data.resolution={width} trains faster, and loses no "
+            "detail that the planes could represent",
         )
 
 

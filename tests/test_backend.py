@@ -41,6 +41,7 @@ except ModuleNotFoundError as error:
 """
 
 
+@pytest.mark.slow
 def test_loops_share_the_threads_of_torch_and_may_be_absent(tmp_path):
     """With one thread, with two, and where numba does not load."""
     broken = tmp_path / "broken"

@@ -38,6 +38,7 @@ def check_outputs(folder: Path) -> None:
     assert len(json.loads((written / "web" / "export.json").read_text())["times"]) == 8
 
 
+@pytest.mark.slow
 def test_the_script_runs(settings, tmp_path):
     text = (EXAMPLES / "first_minute.py").read_text(encoding="utf-8")
     for long, short in (('"320"', '"64"'), ('"--times", "8"', '"--times", "8", *COARSE')):

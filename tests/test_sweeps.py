@@ -293,6 +293,7 @@ def test_a_run_that_began_with_former_names_says_so(tmp_path):
     assert str(caught.value).endswith("experiment=demo seed=1")
 
 
+@pytest.mark.slow
 def test_a_sweep_says_how_long_it_takes_and_its_jobs_go_on(scenes, tmp_path):
     own = tmp_path / "conf" / "sweep"
     own.mkdir(parents=True)

@@ -58,6 +58,7 @@ for arguments in {!r}:
 """
 
 
+@pytest.mark.slow
 def test_commands_work_from_an_empty_folder(installed, tmp_path):
     # The compiled loops would take half a minute to compile for this copy.
     settings = {"PYTHONPATH": str(installed), "XPLANES_CPU_LOOPS": "0"}

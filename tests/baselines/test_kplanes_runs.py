@@ -36,9 +36,8 @@ OTHERS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("grid of cells", marks=pytest.mark.slow), "X-Planes"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["grid of cells", "X-Planes"])
 def test_others_learn(scenes, tmp_path, name):
     config = baseline_config(scenes, "trainer.max_steps=60", *OTHERS[name])
     check_learns(config, tmp_path / "run", gain=2)

@@ -73,6 +73,7 @@ OURS = (
 composed = functools.partial(changed, ())
 
 
+@pytest.mark.slow
 def test_a_baseline_brings_its_published_steps():
     for model, experiment in itertools.product(PUBLISHED, ([], ["experiment=published"])):
         case = model, *experiment
@@ -89,6 +90,7 @@ def test_a_baseline_brings_its_published_steps():
             assert longer["trainer"]["max_steps"] == 7, case
 
 
+@pytest.mark.slow
 def test_a_model_brings_its_initialisation_and_changes_no_other_group():
     for path in sorted((CONF / "model").glob("*.yaml")):
         chosen = [node for node in yaml.safe_load(path.read_text())["defaults"] if node != "_self_"]
@@ -150,6 +152,7 @@ def test_tables_leave_out_what_follows_from_the_sampler():
     assert set(differing(rows)) == {"model.sampler.name"}
 
 
+@pytest.mark.slow
 def test_comparisons_give_all_models_the_same():
     for name, steps in (("fair", 30000), ("lego_models", 1000000)):
         found = set()
@@ -161,6 +164,7 @@ def test_comparisons_give_all_models_the_same():
         assert len(found) == 1, name
 
 
+@pytest.mark.slow
 def test_the_papers_first_table_has_the_published_steps():
     for job in jobs_of("sweep=table1", "data.scene=lego"):
         plain = composed(*job)

@@ -477,9 +477,12 @@ def test_errors_are_one_line_and_leave_1(tmp_path, monkeypatch, capsys):
     write_nerfstudio(
         tmp_path / "away", replace(views, camera_to_world=turned(views.camera_to_world))
     )
+    (tmp_path / "packed").mkdir()
+    (tmp_path / "packed" / "renders.zip").touch()
     cases = [
         (["missing"], "missing is not a folder"),
         (["."], r"not a scene of a known format. Scenes inside it: away, ball"),
+        (["packed"], r"contains renders\.zip\. Unpack renders\.zip first.*ns-process-data"),
         (["ball", "ball"], "give one folder"),
         (["ball", "--out", "ball/a.png"], "the scene's own folder"),
         (["ball", "--out", "a.jpg"], "must end in .png"),

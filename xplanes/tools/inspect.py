@@ -34,6 +34,9 @@ from xplanes.tools.tabulate import markdown
 CONSEQUENCES = {"scale": ("cut", "texels"), "astray": ("cut",)}
 """Findings that are consequences of another one, and not shown with it."""
 
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".xz", ".7z", ".rar")
+"""Endings of archives."""
+
 NATIVE = "data.resolution=null"
 """The setting that reads images at their native size."""
 
@@ -171,12 +174,15 @@ def _recognised(folder: Path, changed: Sequence[str]) -> tuple[Path, str]:
         return _recognised(deeper[0], changed)
     inside = [path.name for path in deeper]
     scenes = f" Scenes inside it: {', '.join(inside)}." if inside else ""
+    packed = sorted(path.name for path in folder.iterdir() if path.suffix in ARCHIVES)
+    unpack = f" Unpack {some(packed)} first." if packed else ""
     there = [f"{path.name}{'/' * path.is_dir()}" for path in folder.iterdir()]
     wanted = "; ".join(f"{name}: {cls.files}" for cls, name in known.items() if cls.files)
     raise SceneError(
         f"{folder} is not a scene of a known format.{scenes} It contains "
-        f"{some(sorted(there)) or 'nothing'}. What the formats need: {wanted}. Choose one with "
-        "data=NAME"
+        f"{some(sorted(there)) or 'nothing'}.{unpack} What the formats need: {wanted}. Choose one "
+        "with data=NAME; raw exports of Polycam, Record3D, Metashape and other programs become "
+        "nerfstudio's format with its ns-process-data"
     )
 
 

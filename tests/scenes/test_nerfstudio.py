@@ -173,7 +173,6 @@ def test_lists_of_file_names_are_the_splits(capture):
     assert [numbers(parts[split]) for split in ("val", "test")] == [[1, 2], [1]]
     for change, words in (
         ({"val_filenames": "a"}, "val_filenames is 'a', not a list"),
-        ({"val_filenames": ["images/none.png"]}, "no image"),
         ({"val_filenames": [names[3]]}, "frame_00003.png is in train_filenames and in val_fil"),
         ({"val_filenames": ["../x.png"]}, "val_filenames leaves the scene's folder"),
         ({"train_filenames": []}, "no frames to train on"),
@@ -183,6 +182,18 @@ def test_lists_of_file_names_are_the_splits(capture):
     capture.content = whole
     capture.frames.pop(5)
     capture.refused("train_filenames names images/frame_00005.png, which is in no frame")
+    (capture.path / names[5]).unlink()
+    with pytest.warns(UserWarning, match=r"1 names in lists .*\n.*train_filenames: .*no image"):
+        assert numbers(capture.read().splits["train"]) == [3, 4, 6, 7, 8, 9]
+
+
+def test_lists_and_frames_may_spell_a_missing_image_differently(capture):
+    names = [frame["file_path"] for frame in capture.frames]
+    capture.content |= {"train_filenames": [f"./{name}" for name in names]}
+    (capture.path / names[5]).unlink()
+    with pytest.warns(UserWarning, match="1 of 10 frames are left out") as told:
+        assert numbers(capture.read().splits["train"]) == [0, 1, 2, 3, 4, 6, 7, 8, 9]
+    assert len(told) == 1
 
 
 @pytest.mark.parametrize("key", ["time", "timestamp"])
@@ -335,6 +346,12 @@ def test_images_that_masks_leave_out_whole_are_left_out(capture):
         views = capture.read(eval_every=100).splits["train"]
     assert numbers(views) == [0, 1, 3, 5, 6, 7, 8, 9]
     assert len(views.ignored) == 8
+    masked(capture, band())
+    (held_out,) = numbers(capture.read(("val",), eval_every=9).splits["val"])
+    masked(capture, band(), of=lambda index: index != held_out)
+    given = settings(NerfstudioSettings, "nerfstudio", capture.path, eval_every=9)
+    with pytest.warns(UserWarning, match=rf"all pixels of 1 of 1 images: .*0{held_out}\.png"):
+        assert len(given.read().splits["val"]) == 9
     masked(capture, 0 * band())
     capture.refused("leave out all pixels of 9 of 9.*mask_use=alpha", mask_use="ignore")
 
@@ -521,6 +538,15 @@ def test_keys_that_are_not_read_are_named(capture):
         capture.read()
 
 
+def test_files_of_rays_beside_images_are_told_of(capture):
+    for name in ("rays_frame_00003.dat", "rays_frame_00004.dat"):
+        (capture.path / "images" / name).write_bytes(b"")
+    with pytest.warns(UserWarning, match=r"rays in files beside 2 of 10 .*rays_frame_00003\.dat"):
+        capture.read()
+    capture.content["enable_ray_loading"] = False
+    capture.read()
+
+
 @pytest.mark.parametrize("level", [0, 255])
 def test_a_colour_may_be_transparent(capture, level):
     expected = capture.read(eval_every=100).splits["train"]
@@ -569,6 +595,11 @@ FLATTER = 2 * math.atan(math.tan(0.5 * ANGLE) / 1.25)
             {"camera_angle_x": ANGLE, "camera_angle_y": FLATTER},
             [FOCAL, 1.25 * FOCAL],
             "camera_angle_y of 10 of 10 frames gives pixels that are not square",
+        ),
+        (
+            {"x_fov": DEGREES, "y_fov": math.degrees(FLATTER)},
+            [FOCAL, 1.25 * FOCAL],
+            "y_fov of 10 of 10 frames gives pixels that are not square",
         ),
     ],
 )

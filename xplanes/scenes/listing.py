@@ -321,11 +321,12 @@ def _without_ignored(listing: Listing, rest: Sequence[int]) -> Listing:
         f"masks leave out all pixels of {len(gone)} of {len(listing)} images: {some(gone)} in "
         f"{listing.paths[0].parent}"
     )
+    # Without a split other images are scored, so that this is said even if the split is missing.
+    warn(f"{text}. These are left out; set data.mask_use=alpha if they show empty space.")
     if not rest:
         raise MissingSplitError(
             f"{text}. Check the masks, or set data.mask_use=alpha if such images show empty space."
         )
-    warn(f"{text}. These are left out; set data.mask_use=alpha if they show empty space.")
     return listing.subset(rest)
 
 

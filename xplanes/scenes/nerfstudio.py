@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar
 
-from xplanes.errors import BrokenFrameError, SceneError
+from xplanes.errors import BrokenFrameError, SceneError, first_of, warn
 from xplanes.scenes.entries import image_path, short
 from xplanes.scenes.listing import Listing, held_out
 from xplanes.scenes.multicamera import is_rig
@@ -58,6 +58,8 @@ def _listed_splits(
     places = {image: index for index, image in enumerate(listing.paths)}
     owner: dict[int, str] = {}
     found: dict[str, list[int]] = {}
+    files = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
+    missing = []
     for split, names in listed.items():
         key = f"{split}_filenames"
         if names is None:
@@ -67,10 +69,10 @@ def _listed_splits(
         for name in names:
             try:
                 image = image_path(str(path), path.parent.resolve(), name, key)
-            except BrokenFrameError:
-                if name in {frame["file_path"] for frame in content["frames"]}:
-                    continue  # A warning was given when it was left out.
-                raise
+            except BrokenFrameError as problem:
+                if PurePosixPath(name) not in files:  # Others were told of as frames.
+                    missing.append(f"{key}: {problem}")
+                continue
             if image not in places:
                 raise SceneError(
                     f"{path}: {key} names {name}, which is in no frame. Add the frame, or remove "
@@ -84,4 +86,6 @@ def _listed_splits(
                     "trained on: take it out of one of them."
                 )
             found.setdefault(split, []).append(places[image])
+    if missing:
+        warn(f"{len(missing)} names in lists of splits are left out:\n{first_of(missing)}")
     return {split: sorted(set(chosen)) for split, chosen in found.items()}

@@ -89,10 +89,10 @@ IGNORED = (
     *("aabb", "aabb_scale", "offset", "scale", "up", "applied_transform", "applied_scale"),
     *("auto_scale_poses_override", "ply_file_path", "sharpness", "sharpness_discard_threshold"),
     *("n_extra_learnable_dims", "importance_sampling", "enable_ray_loading", "fix_premult"),
-    *("colmap_im_id", "colmap_image_id", "camera_id", "cam_id", "id", "name", "n_frames"),
+    *("colmap_im_id", "colmap_image_id", "camera_id", "cam_id", "component_id", "id", "name"),
     *("depth_file_path", "depth_path", "integer_depth_scale", "enable_depth_loading"),
     *("normal_file_path", "depth_unit_scale_factor", "rotation", "render_aabb", "path"),
-    *("crop_width", "crop_height", "blur_score", "n_images", "fps"),
+    *("crop_width", "crop_height", "blur_score", "n_images", "n_frames", "fps"),
 )
 """Keys of other programs without effect here."""
 
@@ -142,6 +142,8 @@ def listing_of(
     if not any(masks):
         masks, meaning = _masks_beside(paths)
     times, source = _times(path, frames, span)
+    if content.get("enable_ray_loading", True):
+        _warn_of_rays(path, paths)
     listing = Listing.checked(
         path,
         [frame.label for frame in frames],
@@ -208,6 +210,18 @@ def _masks_beside(paths: Sequence[Path]) -> tuple[list[Path | None], str]:
     return [], ""
 
 
+def _warn_of_rays(path: Path, images: Sequence[Path]) -> None:
+    """Warn if instant-ngp's files of rays, which replace the camera there, lie beside images."""
+    names = [image.with_name(f"rays_{image.stem}.dat") for image in images]
+    if given := [name for name in names if name.is_file()]:
+        warn(
+            f"{path}: the rays in files beside {len(given)} of {len(images)} images, such as "
+            f"{given[0]}, are not read: rays follow the poses and lenses of {path.name}. If these "
+            "do not describe the cameras, undistort the images; if they do, set "
+            "enable_ray_loading to false."
+        )
+
+
 def _calibrations(
     path: Path, content: Mapping[str, Any], frames: Sequence[_Frame]
 ) -> tuple[Calibration, ...]:
@@ -219,12 +233,18 @@ def _calibrations(
     )
     if stretched := sum(new != old for new, old in zip(found, stated, strict=True)):
         warn(
-            f"{path}: camera_angle_y of {stretched} of {len(found)} frames gives pixels that are "
-            "not square, and is used. If they are square, remove it: Blender's own angle_y "
-            "belongs to the sensor, not to the image."
+            f"{path}: {_angle_key(content, frames)} of {stretched} of {len(found)} frames gives "
+            "pixels that are not square, and is used. If they are square, remove it: Blender's own "
+            "angle_y belongs to the sensor, not to the image."
         )
     _warn_of_two_focal_lengths(path, content, frames, found)
     return found
+
+
+def _angle_key(content: Mapping[str, Any], frames: Sequence[_Frame]) -> str:
+    """The key of the vertical field of view, as the file has it."""
+    given = {*content, *(key for frame in frames for key in frame.entry)}
+    return next((key for key in ("y_fov", "fovy") if key in given), "camera_angle_y")
 
 
 def _warn_of_two_focal_lengths(

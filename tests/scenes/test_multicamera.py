@@ -519,3 +519,16 @@ def test_hdr_videos_are_told_of(tmp_path):
         write_stamped(path, rgb(0), [33 * i for i in range(FRAMES)], color_trc=curve)
         with pytest.warns(UserWarning, match=rf"is an HDR video \({word}\).*SDR"):
             recordings.read_header(path)
+
+
+@pytest.mark.parametrize(("matrix", "red"), [(1, (63, 102, 240)), (5, (81, 90, 240))])
+def test_red_is_red_in_the_matrices_of_hd_and_of_sd_video(tmp_path, matrix, red):
+    with av.open(str(tmp_path / "red.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": "1"})
+        stream.height, stream.width, stream.pix_fmt = 32, 32, "yuv444p"
+        stream.codec_context.colorspace = matrix
+        planes = np.broadcast_to(np.array(red, np.uint8)[:, None, None], (3, 32, 32)).copy()
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(planes, format="yuv444p")))
+        container.mux(stream.encode())
+    (frame,) = recordings.frames(tmp_path / "red.mp4", range(1))
+    assert np.abs(frame.astype(int) - [255, 0, 0]).max() <= 4

@@ -141,6 +141,7 @@ def test_training_there_comes_to_the_numbers_of_plain_torch(fake_gpu, monkeypatc
         "model.rays.samples_per_batch=16384",
         "model.precision=32",
         "model.sampler.thinning=0",
+        "model.sampler.coarse_first=false",
     )
     there, _, _ = trained(name, 16, *options)
     here, _, _ = trained(name, 16, *options, trainer=on_the_cpu)

@@ -66,6 +66,7 @@ OURS = (
     "model.rays.background_share=0.4",
     "model.rays.background_jitter=0.1",
     "model.rays.error_share=0.5",
+    "model.rays.match_exposure=true",
 )
 """The rays of X-Planes, for models that bring others."""
 

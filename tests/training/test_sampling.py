@@ -39,7 +39,8 @@ def along_the_diagonal() -> dict[str, torch.Tensor]:
 def test_images_of_the_trained_field_have_samples_of_their_own(sampling):
     seen = sampling.renderer.render(fog, **along_the_diagonal())
     assert len(seen.samples) == STEPS_OF_A_RAY["pictures"]
-    trained = sampling.render(fog, along_the_diagonal(), TrainingState(0, 0, 0, 0))
+    state = TrainingState(0, sampling.pruned_at, 0, 0)
+    trained = sampling.render(fog, along_the_diagonal(), state)
     assert len(trained.samples) == STEPS_OF_A_RAY["training"]
     assert sampling.renderer.grid is sampling.grid
 

@@ -219,8 +219,8 @@ class OccupancySettings(SamplerSettings):
     # which would take over the content of cells that are emptied too early.
     sweep_at: list[int]
     sweep_every: Count  # Steps between updates of all occupied cells afterwards.
-    # Half as many samples along rays before the first of these updates: all cells may be occupied
-    # until then.
+    # On the CPU, half as many samples along rays before the first of these updates: all cells may
+    # be occupied until then.
     coarse_first: bool
     update_every: Count  # Steps between updates of random cells.
     update_cells: Count  # Maximum number of cells per update.
@@ -372,10 +372,12 @@ class OccupancySampler(Sampler):
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
         training = self._training
-        if self.settings.coarse_first and state.step < self.pruned_at:
+        # Elsewhere the slots for samples would not follow when their number doubles.
+        on_cpu = self.device.type == "cpu"
+        if on_cpu and self.settings.coarse_first and state.step < self.pruned_at:
             training = replace(training, samples=training.samples // 2)
         # On other devices the selection costs more than it saves.
-        thins = self.settings.thinning > 0 and self.device.type == "cpu"
+        thins = self.settings.thinning > 0 and on_cpu
         thins = thins and torch.is_grad_enabled() and isinstance(field, nn.Module)
         return training.render(
             field,

@@ -7,17 +7,7 @@ from pathlib import Path
 import torch
 from figures import curves, panels, save
 from runner import markdown
-from sections import (
-    DATA,
-    Case,
-    Row,
-    Section,
-    number,
-    read_record,
-    settings_of,
-    train_all,
-    trainings,
-)
+from sections import DATA, Case, Row, Section, number, placed, read_record, trainings
 
 from xplanes import SceneDataModule
 from xplanes.files import read_json, write_text
@@ -156,10 +146,7 @@ def blended(scene: str) -> Row:
 
     For a single camera that moves, what a method must beat to mean anything.
     """
-    overrides = (
-        line.format(**{k: v.absolute() for k, v in DATA.items()}) for line in SCENES[scene]
-    )
-    data = SceneDataModule.compose(*overrides)
+    data = SceneDataModule.compose(*placed(SCENES[scene]))
     train, test = data.read_split("train"), data.read_split(data.test_split)
     scores = []
     for index, at in enumerate(test.times):
@@ -172,15 +159,9 @@ def blended(scene: str) -> Row:
     return {"case": f"{scene}, {BLENDED}", **about, "psnr": found[0], "ssim": found[1]}
 
 
-def measure_scenes(work: Path, quick: bool) -> list[Row]:
-    rows = train_all(scenes(), work, quick=quick)
-    return rows if quick else [*rows, blended(MOVING_CAMERA)]
-
-
 def show_scenes(rows: list[Row]) -> str:
     columns = ("scene", "method", "PSNR, dB", "SSIM", "steps", "memory, GB", "seeds")
-    order = list(SCENES)
-    rows = sorted(rows, key=lambda row: order.index(row["scene"]))
+    rows = sorted(rows, key=lambda row: list(SCENES).index(row["scene"]))
     lines = [
         (
             *(row["scene"], row["method"], number(row, "psnr"), number(row, "ssim", 3)),
@@ -219,10 +200,10 @@ SECTIONS: tuple[Section, ...] = (
         name="lego",
         show=show_lego,
     ),
-    Section(
+    trainings(
+        scenes(),
+        besides=lambda: [blended(MOVING_CAMERA)],
         name="scenes",
-        settings=lambda: {case.name: settings_of(case.overrides) for case in scenes()},
-        measure=measure_scenes,
         show=show_scenes,
     ),
 )

@@ -39,8 +39,8 @@ DURATION, HELD = 110, 2500
 """Milliseconds of a frame, and of the last one."""
 
 
-class Film(Callback):
-    """Takes the frames of the film into the run directory.
+class Video(Callback):
+    """Takes the frames of the video into the run directory.
 
     Args:
         frames: How many; the first is that of the initialisation.
@@ -86,17 +86,17 @@ class Film(Callback):
                 views = module.renderer.view(
                     module.field, module.frame, camera, time, torch.ones(3)
                 )
-                folder = Path(trainer.default_root_dir) / "film"
+                folder = Path(trainer.default_root_dir) / "video"
                 folder.mkdir(exist_ok=True)
                 name = f"{self._next:03d}_{time:.4f}_{training_seconds(trainer):.1f}.png"
                 Image.fromarray(to_bytes(views["colour"].clamp(0, 1)).numpy()).save(folder / name)
             self._next += 1
 
 
-def truth(film: Film, place: int, time: float) -> Image.Image:
+def truth(video: Video, place: int, time: float) -> Image.Image:
     """The scene as the camera of a frame sees it, on white."""
-    film._next = place
-    pose = film.camera().camera_to_world
+    video._next = place
+    pose = video.camera().camera_to_world
     picture = Image.fromarray(render_image(build_demo_scene(SCENE, 0).pose(time), pose, RENDERED))
     white = Image.new("RGBA", picture.size, "white")
     return Image.alpha_composite(white, picture).convert("RGB").crop(BOX)
@@ -129,13 +129,13 @@ def main() -> None:
     folder = (args.work / f"{args.seconds:g}s_{args.frames}").absolute()
     lines = [f"data.scene={SCENE}", f"data.resolution={SIZE}", "callbacks.evaluation.at=[]"]
     lines += [f"trainer.max_seconds={args.seconds:g}", "trainer.accelerator=cpu", "plugins=[hero]"]
-    lines += ["+callbacks.hero._target_=hero.Film", f"+callbacks.hero.frames={args.frames}"]
+    lines += ["+callbacks.hero._target_=hero.Video", f"+callbacks.hero.frames={args.frames}"]
     run_apart(lines, folder, CPU_CLOCK)
-    film, sheets, words = Film(args.frames), [], ""
-    for path in sorted((folder / "film").glob("*.png")):
+    video, sheets, words = Video(args.frames), [], ""
+    for path in sorted((folder / "video").glob("*.png")):
         place, time, seconds = path.stem.split("_")
         true, field = (
-            truth(film, int(place), float(time)),
+            truth(video, int(place), float(time)),
             Image.open(path).convert("RGB").crop(BOX),
         )
         words = f"{float(seconds):.0f} s, {psnr(true, field):.1f} dB"

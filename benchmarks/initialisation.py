@@ -18,7 +18,7 @@ DEMOS = ("excavator", "balls")
 FEW, ALL = 5, 50
 
 
-class Start(NamedTuple):
+class Kind(NamedTuple):
     """An initialisation: what it consists of, and its settings or the control of its LRM."""
 
     words: str
@@ -27,25 +27,25 @@ class Start(NamedTuple):
     every: bool = False
 
 
-STARTS = {
-    "random": Start("planes and decoder at random", ("lrm=none",), every=True),
-    "decoder alone": Start("planes at random, the LRM's decoder", control="random_planes"),
-    "mean triplane": Start(
+KINDS = {
+    "random": Kind("random planes and decoder", ("lrm=none",), every=True),
+    "decoder alone": Kind("random planes, the LRM's decoder", control="random_planes"),
+    "mean triplane": Kind(
         "mean of the LRM's triplanes of 64 training objects", control="mean", every=True
     ),
-    "another scene": Start("triplanes of another scene's video", control="other_scene"),
-    "one frame": Start("the middle frame's triplane at all times", control="one_frame"),
-    "fresh decoder": Start(
-        "the LRM's planes, a decoder at random", control="fresh_decoder", every=True
+    "another scene": Kind("triplanes of another scene's video", control="other_scene"),
+    "one frame": Kind("the middle frame's triplane at all times", control="one_frame"),
+    "fresh decoder": Kind(
+        "the LRM's planes, a random decoder", control="fresh_decoder", every=True
     ),
-    "without S": Start(
-        "robust PCA, but time planes at random and no L_r",
+    "without S": Kind(
+        "robust PCA, but random time planes and no L_r",
         ("lrm=tiny", "decomposition.dynamic=random", "model.loss.sparse_weight=0.0"),
     ),
-    "median": Start("static part: median over time, no robust PCA", control="median"),
-    "not held": Start("neither L_r nor the distance term", ("lrm=tiny", *controls.NOT_HELD)),
-    "LRM": Start("the method", ("lrm=tiny",), every=True),
-    "oracle": Start("triplanes fitted to true views", control="oracle", every=True),
+    "median": Kind("static part: median over time, no robust PCA", control="median"),
+    "not held": Kind("neither L_r nor the distance term", ("lrm=tiny", *controls.NOT_HELD)),
+    "LRM": Kind("the method", ("lrm=tiny",), every=True),
+    "oracle": Kind("triplanes fitted to true views", control="oracle", every=True),
 }
 
 
@@ -68,7 +68,7 @@ def within(seconds: int, *plugins: str) -> tuple[str, ...]:
 def cases() -> list[Case]:
     found = []
     for views in (FEW, ALL):
-        for name, start in STARTS.items():
+        for name, start in KINDS.items():
             for scene in (*DEMOS, "lego"):
                 if (views == ALL and not start.every) or (scene, name) == ("lego", "oracle"):
                     continue
@@ -117,7 +117,7 @@ def table(rows: list[Row], views: int) -> str:
         ]
         cells = [number(row, "psnr") for row in own]
         lead = "" if name == "random" else f"{fmean(leads):+.2f}"
-        lines.append((name, STARTS[name].words, *cells, lead))
+        lines.append((name, KINDS[name].words, *cells, lead))
     return markdown(("initialisation", "what it is", *scenes, "mean lead, dB"), lines)
 
 

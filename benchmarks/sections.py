@@ -107,10 +107,16 @@ def flat(config: Mapping[str, Any], before: str = "") -> Row:
     return found
 
 
+def placed(overrides: Iterable[str]) -> list[str]:
+    """Overrides with the folders of `DATA`."""
+    folders = {name: path.absolute() for name, path in DATA.items()}
+    return [line.format(**folders) for line in overrides]
+
+
 @cache
 def settings_of(overrides: tuple[str, ...]) -> Row:
     """What a run with these overrides depends on: its settings, weights and procedural scene."""
-    plain = compose_plain("train", [line.format(**DATA) for line in overrides])
+    plain = compose_plain("train", placed(overrides))
     found = flat({name: plain[name] for name in MEASURED})
     found = {key: value for key, value in found.items() if not NOT_MEASURED.match(key)}
     if (name := found.get("lrm.bundled")) is not None:
@@ -121,19 +127,25 @@ def settings_of(overrides: tuple[str, ...]) -> Row:
 
 
 def trainings(
-    cases: Sequence[Case], *, before: Callable[[], None] = lambda: None, **about: Any
+    cases: Sequence[Case],
+    *,
+    before: Callable[[], None] = lambda: None,
+    besides: Callable[[], list[Row]] = list,
+    **about: Any,
 ) -> Section:
     """A section of training runs: each a process with one thread, whose CPU seconds count.
 
     Args:
         cases: What is trained.
         before: Called before the first run.
+        besides: Measures rows that need no training, for full measurements.
         about: The section's other attributes.
     """
 
     def measure(work: Path, quick: bool) -> list[Row]:
         before()
-        return train_all(cases, work, quick=quick)
+        rows = train_all(cases, work, quick=quick)
+        return rows if quick else rows + besides()
 
     def settings() -> dict[str, Row]:
         return {case.name: settings_of(case.overrides) for case in cases}
@@ -160,11 +172,9 @@ def train_all(cases: Sequence[Case], work: Path, *, quick: bool = False) -> list
         finished = (folder / "metrics.json").is_file()
         if time.monotonic() > LIMITS["until"] and not finished:
             return None
-        lines = [
-            line.format(**{k: v.absolute() for k, v in DATA.items()}) for line in case.overrides
-        ]
         if not finished:
             print(f"{case.name}, seed {seed}", flush=True)
+        lines = placed(case.overrides)
         return run_apart([*lines, "logger=none", "media=false", f"seed={seed}"], folder, CPU_CLOCK)
 
     with ThreadPoolExecutor(int(LIMITS["together"])) as pool:

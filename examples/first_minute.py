@@ -73,7 +73,7 @@ xplanes("table", OUTPUTS)
 # %% [markdown]
 # ## Render
 #
-# One picture of a moment, from a camera of your choice. `orbit.webp` instead of the PNG would be a
+# One picture at one time, from a camera of your choice. `orbit.webp` instead of the PNG would be a
 # video: the camera goes round, and time goes back and forth.
 
 # %%

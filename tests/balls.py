@@ -1,24 +1,18 @@
 """Small scenes whose content is known exactly: a moving or static ball, seen from all sides."""
 
 import math
+from dataclasses import replace
 
 import torch
 
-from xplanes.scenes.batches import RaySettings
 from xplanes.scenes.cameras import PosedCamera, focal_length, look_at
+from xplanes.scenes.datamodule import UNIFORM
 from xplanes.scenes.views import Scene, Views
 
 STATIC = torch.zeros(3)
 
-RAYS = RaySettings(
-    per_batch=64,
-    samples_per_batch=4096,
-    background="white",
-    skip_background=True,
-    background_share=0.1,
-    background_jitter=0.0,
-    error_share=0.0,
-    match_exposure=False,
+RAYS = replace(
+    UNIFORM, per_batch=64, samples_per_batch=4096, skip_background=True, background_share=0.1
 )
 """Rays of most tests of batches; what they need otherwise they replace."""
 

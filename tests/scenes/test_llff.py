@@ -49,7 +49,7 @@ def test_cameras_and_images_of_the_width_asked_for(folder, resolution, width):
 
 def test_captures_of_dynamic_scenes_have_the_times_in_their_names(folder):
     assert read(folder, static=False).splits["train"].times[3] == pytest.approx(3 / 9)
-    for number in range(3):  # Nvidia's Dynamic Scenes have a folder for each moment.
+    for number in range(3):  # Nvidia's Dynamic Scenes have a folder for each timestep.
         save(folder / f"mv_images/{number:05d}/cam01.png", picture(number))
     assert LlffSettings.recognises(folder)
     assert not MultiCameraSettings.recognises(folder)

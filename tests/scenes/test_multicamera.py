@@ -365,7 +365,7 @@ def test_cameras_of_different_lengths_and_rates(videos, tmp_path, caplog):
 def test_a_frame_that_one_camera_lacks_is_left_out(tmp_path, apart, gone):
     folder = neural_3d_video(tmp_path / "scene", write_images, "")
     whole = read(folder).splits["train"]
-    for camera in range(CAMERAS):  # Cameras may have their own numbers for the same moment.
+    for camera in range(CAMERAS):  # Cameras may have their own numbers for the same timestep.
         for path in sorted((folder / f"cam{camera:02d}").iterdir(), key=lambda p: int(p.stem)):
             path.rename(path.with_name(f"x{int(path.stem) + apart * camera}.png"))
     for number in gone:

@@ -27,6 +27,7 @@ from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.lenses import Lenses, LensModel
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Intrinsics, Scene, Views
+from xplanes.tools.image_findings import texel_findings
 from xplanes.tools.inspect import (
     Choice,
     cameras_of,
@@ -306,6 +307,15 @@ WRONG = {
     "two sizes": (two_sizes, {}, "sizes", r"8 of 16x16 px, 12 of 32x32 px"),
     "coarse planes": (ball, {"texels": 2}, "texels", r"planes with 2 texels.*data\.resolution="),
 }
+
+
+@pytest.mark.parametrize(
+    ("fine", "advice"),
+    [(True, "model.fine.texels=256 adds"), (False, "Planes with 256 texels per side would")],
+)
+def test_finer_planes_are_recommended_as_the_model_can_have_them(fine, advice):
+    (found,) = texel_findings(15, 960, 960, 64, fine=fine)
+    assert f"960 pixels wide. {advice}" in found.text
 
 
 @pytest.mark.parametrize("name", WRONG)

@@ -85,12 +85,12 @@ def test_steps_stand_side_by_side_a_row_per_run(tmp_path):
     assert areas(path) == {TRUE: 2 * 40 * 40, DEPTH: 2 * 40 * 40}
 
 
-def test_a_film_shows_a_step_after_the_other_beside_the_truth(tmp_path):
+def test_a_video_shows_a_step_after_the_other_beside_the_truth(tmp_path):
     for number, steps in enumerate([(0, 20, 50), (0, 80)]):
         pictured(tmp_path / f"{number}", model=f"{number}", steps=steps)
-    film = write_sheet(tmp_path, tmp_path / "film.webp", what="steps", size=40)
+    video = write_sheet(tmp_path, tmp_path / "video.webp", what="steps", size=40)
     frames, milliseconds = [], []
-    with Image.open(film) as picture:
+    with Image.open(video) as picture:
         for frame in ImageSequence.Iterator(picture):
             frames.append(np.asarray(frame.convert("RGB")).reshape(-1, 3).astype(int))
             milliseconds.append(frame.info["duration"])

@@ -41,6 +41,10 @@ class ExposureSampler(WrappingSampler):
     def parts(self) -> dict[str, nn.Module]:
         return self.inner.parts | {"exposures": self.exposures}
 
+    @property
+    def outline(self) -> str:
+        return f"{self.inner.outline}, exposures matched".removeprefix(", ")
+
     def groups(self) -> list[Group]:
         gains: Group = {"params": [self.exposures.logarithms], "lr": RATE, "name": "exposures"}
         return [*self.inner.groups(), gains]

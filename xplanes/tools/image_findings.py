@@ -153,7 +153,9 @@ def image_findings(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iter
     yield from opaque_findings(scene)
 
 
-def texel_findings(per_texel: float, native: int, wide: int, resolution: int) -> Iterator[Finding]:
+def texel_findings(
+    per_texel: float, native: int, wide: int, resolution: int, *, fine: bool
+) -> Iterator[Finding]:
     """Warn if the images have far more detail than the planes can represent.
 
     Args:
@@ -161,17 +163,20 @@ def texel_findings(per_texel: float, native: int, wide: int, resolution: int) ->
         native: Width of these images.
         wide: Width of the images in training.
         resolution: Texels along an axis of the planes.
+        fine: Whether the model can have finer planes beside them (``model.fine``).
     """
     per_texel *= wide / native
     if per_texel > COARSE:
         width = max(1, round(wide * 0.5 * COARSE / per_texel))
         finer = 2 ** round(math.log2(resolution * per_texel / (0.5 * COARSE)))
+        more = f"Planes with {finer} texels per side would show it"
+        if fine:
+            more = f"model.fine.texels={finer} adds finer planes, which pay after two minutes"
         yield Finding(
             "texels",
             f"a texel of planes with {resolution} texels per side covers {per_texel:.0f} pixels of "
-            f"images {wide} pixels wide. model.fine.texels={finer} adds finer planes, which pay "
-            f"from two minutes of training on; data.resolution={width} trains faster, and loses no "
-            "detail that the planes could represent",
+            f"images {wide} pixels wide. {more}; data.resolution={width} trains faster, and "
+            "loses no detail that the planes could represent",
         )
 
 

@@ -210,7 +210,8 @@ def inspect(choice: Choice) -> Capture:
         texels = model.texels(pixels_of_detail(train, frame, scene.is_surrounded))
         if texels is not None:
             width = _width_of_training(choice, scene) or train.width
-            findings += texel_findings(pixels / texels, train.width, width, texels)
+            fine = getattr(model, "fine", None) is not None
+            findings += texel_findings(pixels / texels, train.width, width, texels, fine=fine)
     follows = {kind for each in findings for kind in CONSEQUENCES.get(each.kind, ())}
     findings = [each for each in findings if each.kind not in follows]
     return Capture(choice, scene, frame, problem, images, tuple(findings), texels)

@@ -335,7 +335,8 @@ def test_samples_that_do_not_count_change_nothing():
     theirs.observe(cells[live], density[live])
     untouched.observe(cells, density, torch.zeros(40, dtype=torch.bool))
     for name, value in ours.state_dict().items():
-        assert torch.equal(value, theirs.state_dict()[name]), name
+        # Compiled loops and PyTorch round a weighted mean differently.
+        torch.testing.assert_close(value, theirs.state_dict()[name], rtol=1e-6, atol=1e-7)
         assert torch.equal(untouched.state_dict()[name], before[name]), name
     assert not torch.equal(ours.density, before["density"])
 

@@ -1,10 +1,10 @@
-"""Compiled loops for reading planes on the CPU; the reference implementation is in `lookup`.
+"""Compiled loops over planes on the CPU; the references are in `lookup` and `regularisers`.
 
 Indices and weights stay in registers: only planes, points and results are in memory. Imported only
 when needed, since numba takes a second to load.
 """
 
-# ruff: noqa: D103 (the callers in lookup.py document these loops)
+# ruff: noqa: D103 (the callers document these loops)
 
 import numpy as np
 from numba import get_num_threads, prange
@@ -94,11 +94,14 @@ def gather_onto(space, points, features):
         for plane in range(3):
             c0, c1, u0, u1 = space_taps(points[n, 0 if plane < 2 else 1], space.shape[2])
             r0, r1, v0, v1 = space_taps(points[n, 1 if plane < 1 else 2], space.shape[1])
-            target = features[n, plane, : space.shape[3]]
-            add(target, space[plane, r0, c0], v0 * u0)
-            add(target, space[plane, r0, c1], v0 * u1)
-            add(target, space[plane, r1, c0], v1 * u0)
-            add(target, space[plane, r1, c1], v1 * u1)
+            w00, w01, w10, w11 = v0 * u0, v0 * u1, v1 * u0, v1 * u1
+            for c in range(space.shape[3]):
+                features[n, plane, c] += (
+                    w00 * space[plane, r0, c0, c]
+                    + w01 * space[plane, r0, c1, c]
+                    + w10 * space[plane, r1, c0, c]
+                    + w11 * space[plane, r1, c1, c]
+                )
 
 
 @njit(inline="always", **COMPILE)
@@ -156,3 +159,28 @@ def scatter_time(points, times, axes, gradient, tasks, time):
             if r1 & (tasks - 1) == own:
                 add(target[r1, c0], source, v1 * u0)
                 add(target[r1, c1], source, v1 * u1)
+
+
+@njit(inline="always", **COMPILE)
+def add_differences(target, values, others, factor):
+    for n in range(len(target)):
+        target[n] += factor * (values[n] - others[n])
+
+
+@njit(parallel=True, **COMPILE)
+def add_variation(planes, steps, rows, columns, gradient):
+    """Add factors times the sums of differences from the neighbours along rows and columns.
+
+    The texels of a row, and the channels of each, are one axis; neighbours are ``steps`` apart.
+    """
+    height = planes.shape[1]
+    for task in prange(planes.shape[0] * height):
+        number, row = task // height, task % height
+        here, target = planes[number, row], gradient[number, row]
+        if columns:
+            add_differences(target[steps:], here[steps:], here[:-steps], columns)
+            add_differences(target[:-steps], here[:-steps], here[steps:], columns)
+        if rows and row > 0:
+            add_differences(target, here, planes[number, row - 1], rows)
+        if rows and row < height - 1:
+            add_differences(target, here, planes[number, row + 1], rows)

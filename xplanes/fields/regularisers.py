@@ -8,6 +8,8 @@ steps, with a correspondingly larger weight.
 import torch
 from torch import Tensor
 
+from xplanes.backend import compiled, cpu_loops
+
 
 def total_variation(plane: Tensor, dims: tuple[int, ...]) -> Tensor:
     """Sum over ``dims`` of the mean squared difference between neighbours. [P, H, W, C] -> []"""
@@ -25,6 +27,17 @@ def add_total_variation_gradient(
     gradient: Tensor, plane: Tensor, dims: tuple[int, ...], weight: float
 ) -> None:
     """Add ``weight`` times the gradient of `total_variation` to ``gradient``."""
+    like = plane.is_contiguous() and gradient.is_contiguous() and gradient.dtype == plane.dtype
+    if set(dims) <= {1, 2} and like and cpu_loops(plane):
+        counts = [plane.narrow(dim, 0, plane.shape[dim] - 1).numel() for dim in (1, 2)]
+        values, target = (each.detach().flatten(2).numpy() for each in (plane, gradient))
+        factors = (
+            values.dtype.type(2 * weight / count if dim in dims and count else 0)
+            for dim, count in enumerate(counts, start=1)
+        )
+        cpu = compiled("xplanes.fields.lookup_numba")
+        cpu.add_variation(values, plane.shape[3], *factors, target)
+        return
     for dim in dims:
         length = plane.shape[dim] - 1
         if length < 1:

@@ -1,9 +1,11 @@
 """The occupancy grid: cells over space and time, marked empty or occupied."""
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from xplanes.backend import compiled, cpu_loops
 from xplanes.rendering.box import Field
 from xplanes.rendering.compositing import OPAQUE
 
@@ -88,6 +90,13 @@ class OccupancyGrid(nn.Module):
         self.density.mul_(self.likely)
         torch.gt(self.density, self.empty_density, out=self.occupied)
 
+    def occupied_cells(self) -> Tensor:
+        """Numbers of all occupied cells, ascending. int64 [N]"""
+        if self.occupied.device.type == "cpu":
+            # Up to ten times as fast as PyTorch's.
+            return torch.from_numpy(np.flatnonzero(self.occupied.numpy()))
+        return self.occupied.nonzero()[:, 0]
+
     @property
     def occupied_fraction(self) -> float:
         """Share of all cells that are occupied."""
@@ -103,6 +112,12 @@ class OccupancyGrid(nn.Module):
             live: Which samples count, a prefix of them; all when None. [N]
         """
         density = self._usable(density)
+        if live is None and cpu_loops(self.density):
+            arrays = cells, density, self.allowed, self.density, self.least, self.occupied
+            numbers = map(np.float32, (self.decay, TRUST, self.empty_density))
+            cpu = compiled("xplanes.rendering.rays_numba")
+            cpu.observe_cells(*(array.numpy() for array in arrays), *numbers)
+            return
         if live is not None:
             # The others repeat those that count, without effect. They repeat different ones, as
             # writes to a single cell would be serialised.
@@ -133,7 +148,7 @@ class OccupancyGrid(nn.Module):
         """
         device = self.density.device
         chunk = chunk or (2**15 if device.type == "cpu" else 2**19)
-        cells = self.occupied.nonzero()[:, 0]
+        cells = self.occupied_cells()
         seen = torch.zeros_like(self.density)
         for part in cells.split(chunk):
             uniform = torch.rand(len(part), 4, generator=generator).to(device)
@@ -208,7 +223,7 @@ class OccupancyGrid(nn.Module):
             [N, 3], [N]
         """
         if uniform.device.type == "cpu":
-            cells = self.occupied.nonzero()[:, 0]
+            cells = self.occupied_cells()
             if len(cells):
                 cells = cells[(uniform[:, 0] * len(cells)).long().clamp_(max=len(cells) - 1)]
             return self.draw(cells, uniform[: len(cells), 1:])
@@ -220,7 +235,7 @@ class OccupancyGrid(nn.Module):
     def _near_occupied(self, count: int, generator: torch.Generator) -> Tensor:
         """Random cells of the same time within one step of an occupied one, along each axis."""
         device = self.density.device
-        cells = self.occupied.nonzero()[:, 0]
+        cells = self.occupied_cells()
         if not len(cells):
             return cells
         cells = cells[torch.randint(len(cells), (count,), generator=generator).to(device)]

@@ -101,6 +101,25 @@ def fill_samples(
                 place += 1
 
 
+@njit(**EXACT)
+def observe_cells(cells, observed, allowed, density, least, occupied, decay, trust, empty):
+    """Densities observed in cells of the grid; several in a cell count as their maximum."""
+    highest, lowest = np.empty_like(observed), np.empty_like(observed)
+    for n in range(len(cells)):
+        cell = cells[n]
+        highest[n] = max(density[cell] * decay, observed[n]) if allowed[cell] else 0
+        raised = least[cell] + trust * (observed[n] - least[cell])
+        lowest[n] = min(observed[n], raised)
+    for n in range(len(cells)):
+        density[cells[n]], least[cells[n]] = highest[n], lowest[n]
+    for n in range(len(cells)):
+        cell = cells[n]
+        density[cell] = max(density[cell], highest[n])
+        least[cell] = min(least[cell], lowest[n])
+    for n in range(len(cells)):
+        occupied[cells[n]] = density[cells[n]] > empty
+
+
 @njit(parallel=True, **COMPILE)
 def composite(optical_depth, colour, distances, starts, opaque, weights, total):
     """Weights of the samples, and colour, opacity and depth of the rays."""

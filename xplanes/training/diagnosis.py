@@ -26,8 +26,8 @@ def usable(gradient: Tensor) -> bool:
     """
     if gradient.is_contiguous():
         flat = gradient.view(-1)
-        return bool(torch.dot(flat, flat).isfinite())
-    return bool(torch.linalg.vector_norm(gradient).isfinite())
+        return math.isfinite(torch.dot(flat, flat))
+    return math.isfinite(torch.linalg.vector_norm(gradient))
 
 
 def broken_flag(parameters: Iterable[nn.Parameter], losses: Sequence[Tensor]) -> Tensor:

@@ -223,8 +223,11 @@ def warm_up_loops(module: RadianceModule, data: SceneDataModule, device: torch.d
             rehearse(module, rays)
             synchronize(device)
             return
-        rendering = module.sampler.render(module.field, rays, module.state)
+        sampler = copy.deepcopy(module.sampler)
+        rendering = sampler.render(module.field, rays, module.state)
         rendering.colour.sum().backward()
+        sampler.observe(rendering)
+        module.model.regularise(module.state)
         module.zero_grad(set_to_none=True)
         if isinstance(module.renderer, RayRenderer):
             ends = rays["origins"], rays["directions"]

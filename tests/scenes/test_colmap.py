@@ -280,10 +280,13 @@ def test_where_the_model_is(capture):
     capture.refused(r"pictures is not a folder\. Set data\.images", images="pictures")
 
 
-def test_further_models_are_told_of(capture, caplog):
-    (capture.path / "sparse/1").mkdir()
-    capture.read("train")
-    assert "holds 2 models" in caplog.text
+@pytest.mark.parametrize("text", [False, True])
+def test_the_largest_of_several_models_is_read(capture, caplog, text):
+    images = [(f"frame_00{i}.png", capture.poses[i], 1, 2) for i in range(8)]
+    write_colmap(capture.path / "sparse/1", CAMERA, images, text=text)
+    write_colmap(capture.path / "sparse/0", CAMERA, images[:3])
+    assert len(capture.views()) == 8
+    assert "sparse/1 is read, which has the most images (0 has 3, 1 has 8)" in caplog.text
 
 
 def test_missing_and_unregistered_images(capture, caplog):

@@ -15,7 +15,14 @@ import numpy as np
 
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.files import natural
-from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, models_inside, read_model
+from xplanes.scenes.colmap_model import (
+    MODELS,
+    SparseModel,
+    find_model,
+    image_count,
+    models_inside,
+    read_model,
+)
 from xplanes.scenes.entries import (
     decoded,
     image_path,
@@ -50,7 +57,9 @@ class ColmapSettings(CaptureSettings):
     files: ClassVar = "sparse/0 with cameras.bin and images.bin (or .txt), and images"
     more_splits: ClassVar = ", or name the folders of some cameras in data.test_cameras"
 
-    model: Location | None  # Folder of the COLMAP model; null: sparse/0, sparse or colmap/sparse/0.
+    # Folder of the COLMAP model; null: sparse/0 (or the largest beside it), sparse or
+    # colmap/sparse/0.
+    model: Location | None
     images: Location  # Folder of the images that COLMAP was run on.
     # Folder of masks: NAME.png for each image NAME, black outside the foreground; null for none.
     # Masks that removed moving objects for COLMAP would remove them here, too.
@@ -217,17 +226,8 @@ def _model_folder(folder: Path, name: str | None) -> Path:
     """The folder of the sparse model."""
     names = MODELS if name is None else (name,)
     if (path := find_model(folder, names)) is not None:
-        others = [
-            other.name
-            for other in path.parent.iterdir()
-            if other != path and other.name.isdigit() and other.is_dir()
-        ]
-        if name is None and path.name == "0" and others:
-            logger.warning(
-                "%s holds %d models, because COLMAP could not join them all: %s is read. "
-                "Choose another with data.model",
-                *(path.parent, len(others) + 1, path),
-            )
+        if name is None and path.name == "0":
+            path = _largest(path)
         return path
     found = models_inside(folder) if name is None else []
     if len(found) == 1:
@@ -243,6 +243,22 @@ def _model_folder(folder: Path, name: str | None) -> Path:
         f"{folder} holds no COLMAP model: there is no cameras.bin or cameras.txt in "
         f"{', '.join(names)}. Set data.model to the model's folder, relative to {folder}."
     )
+
+
+def _largest(first: Path) -> Path:
+    """The numbered model with the most images among ``first`` and those beside it."""
+    numbered = (path for path in models_inside(first.parent) if path.name.isdigit())
+    if not (others := [path for path in numbered if path != first]):
+        return first
+    counts = {path: image_count(path) for path in (first, *others)}
+    largest = max(counts, key=lambda path: counts[path])
+    logger.warning(
+        "%s holds %d models, because COLMAP could not join them all. %s is read, which has the "
+        "most images (%s). Choose another with data.model",
+        *(first.parent, len(counts), largest),
+        ", ".join(f"{path.name} has {count}" for path, count in counts.items()),
+    )
+    return largest
 
 
 def _camera(name: str) -> str:

@@ -110,6 +110,19 @@ def models_inside(folder: Path) -> list[Path]:
     return found
 
 
+def image_count(folder: Path) -> int:
+    """Number of images in the sparse model in ``folder``.
+
+    Raises:
+        SceneError: If its list of images is damaged.
+    """
+    path = _part(folder, "images")
+    if path.suffix != ".bin":
+        return sum(1 for _ in _images(path))
+    with _binary(path) as file:
+        return file.take(COUNT, "the number of images")[0]
+
+
 def read_model(folder: Path) -> SparseModel:
     """Read and check a sparse model; binary files take precedence over text files.
 

@@ -376,7 +376,10 @@ def table(capture: Capture) -> str:
     if known["static_reason"]:
         text.append(f"static  {known['static_reason']}")
     elif known["splits"]["train"]["timesteps"] == 1:
-        text.append("static  all training views have the same time, so nothing can move")
+        text.append(
+            "static  all training views have the same time, so nothing can move; if something does, "
+            "the scene's files must give the times"
+        )
     if (cube := known["cube"]) is not None:
         centre = ", ".join(f"{value:.3g}" for value in cube["centre"])
         near, middle, far = cube["camera_distance"]

@@ -377,8 +377,8 @@ def table(capture: Capture) -> str:
         text.append(f"static  {known['static_reason']}")
     elif known["splits"]["train"]["timesteps"] == 1:
         text.append(
-            "static  all training views have the same time, so nothing can move; if something does, "
-            "the scene's files must give the times"
+            "static  all training views have the same time, so nothing can move; if something "
+            "does, the scene's files must give the times"
         )
     if (cube := known["cube"]) is not None:
         centre = ", ".join(f"{value:.3g}" for value in cube["centre"])

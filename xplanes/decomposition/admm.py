@@ -287,7 +287,7 @@ class Penalty:
         return primal, norms.change / max(norms.multiplier, 1e-30 * self._norm)
 
     def balance(self, iteration: int, norms: Norms, *, feasible: bool) -> None:
-        """Choose whether to grow, keep or shrink until the next check.
+        """Choose whether the penalty grows, stays or shrinks until the next check.
 
         Each change of direction halves the logarithmic rate, so that the penalty settles.
 

@@ -101,9 +101,9 @@ def rank1_factors(planes: Tensor) -> tuple[Tensor, Tensor]:
 def shared_factors(sparse: Tensor, rows: Rows) -> list[Tensor]:
     """Time planes that are shared by several orientations, each orientation a product of two.
 
-    Alternating least squares per frame and channel: with all other factors fixed one has a closed
-    form, so the product loss never rises. Each factor is initialised from the rank-1 pairs of each
-    orientation, as the mean of its candidates with their signs made equal.
+    Alternating least squares per frame and channel: each factor has a closed form with all others
+    fixed, so the product loss never rises. Each factor is initialised with the mean of its
+    candidates from the rank-1 pairs of all orientations, after their signs are aligned.
 
     Args:
         sparse: The sparse part, square planes. [T, 3, C, N, N]

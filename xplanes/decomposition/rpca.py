@@ -104,8 +104,8 @@ def robust_pca(
             below ten times this. float32 cannot reach much below 1e-6.
         max_iterations: Maximum number of iterations, at least 1. Warns if they do not reach the
             tolerance.
-        method: "adaptive" (over-relaxed ADMM with a balanced penalty that then grows no faster
-            than the split converges) or "admm" (the paper's Algorithm 1).
+        method: "adaptive" (over-relaxed ADMM that balances the penalty between residual and change)
+            or "admm" (the paper's Algorithm 1).
         scale: Unit of Y for the penalty: "rms" (root mean square) or "none" (1).
         progress: Show a progress bar after two seconds.
         out: Output tensors for L and S, with the computation type and layout of the matrix; new

@@ -139,7 +139,7 @@ class SparseProduct:
         self.sparse = self.sparse.to(planes.device, planes.dtype)
 
     def _varying(self, planes: Tensor, target: Tensor, frames: Tensor) -> Tensor:
-        """Sum of the squared errors at frames, less the sum of the target's own squares. []"""
+        """Sum of squared errors at frames, minus the constant sum of the target's squares. []"""
         count, (height, width) = len(self.sparse), target.shape[-2:]
         wide = frame_profiles(planes, frames, count, width)
         tall = wide if height == width else frame_profiles(planes, frames, count, height)

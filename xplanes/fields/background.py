@@ -19,7 +19,7 @@ DARKEST = 0.02
 """Initial colours lie between this and 1 minus this, where the sigmoid is not saturated."""
 
 DENSITY_SCALE, DENSITY_BIAS = 25.0, -2.0
-"""Of the decoder. Initially about a third of a ray's light comes from infinity."""
+"""Scale and bias of the density: about a third of a ray's light initially comes from infinity."""
 
 
 def contract(points: Tensor) -> Tensor:
@@ -70,7 +70,7 @@ class Background(nn.Module):
         samples: Samples of a ray behind the cube, besides the one at infinity; with 0, colour
             depends on direction only.
         precision: "bf16" multiplies in bfloat16.
-        colour: Initial colour from 0 to 1; that of the decoder's random weights when None. [3]
+        colour: Initial colour from 0 to 1; set by the decoder's random weights when None. [3]
     """
 
     def __init__(

@@ -121,8 +121,8 @@ class ViewDependentField(RadianceField):
         Args:
             points: Positions in the field's frame. [N, 3]
             times: Times from 0 to 1. [N]
-            directions: Unit viewing directions in the field's frame; None, for callers that need
-                only the density, stands for the third axis. [N, 3]
+            directions: Unit viewing directions in the field's frame; the negative third axis when
+                None, for callers that need only the density. [N, 3]
 
         Returns:
             Colour from 0 to 1 and density per unit length of the field's frame. [N, 3], [N]

@@ -23,7 +23,7 @@ _DENSITIES: dict[DensityActivation, Callable[[Tensor], Tensor]] = {
 """To add an activation of the density, add it here and to `DensityActivation`."""
 
 ROWS = 256
-"""On the CPU, matrices are padded to a multiple of this many rows; of more if they are long.
+"""On the CPU, matrices are padded to a multiple of this many rows, or of more if they are long.
 
 oneDNN compiles and caches one kernel per number of rows, and every batch has a different number of
 samples.
@@ -33,7 +33,7 @@ samples.
 def half_rows(values: Tensor) -> Tensor:
     """The values in bfloat16, on the CPU padded with rows of zeros. [N, C] -> [at least N, C]
 
-    The padding is less than `ROWS` rows, or than a sixteenth of the values.
+    The padding is less than `ROWS` rows or a sixteenth of the values, whichever is more.
     """
     values = values.to(torch.bfloat16)
     if values.device.type != "cpu":
@@ -87,7 +87,7 @@ class Decoder(nn.Module):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Arguments that its weights depend on: all except channels and precision."""
+        """Constructor arguments that its weights require: all except channels and precision."""
         return {
             "width": self.width,
             "hidden": self.hidden,

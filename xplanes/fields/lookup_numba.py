@@ -169,9 +169,9 @@ def add_differences(target, values, others, factor):
 
 @njit(parallel=True, **COMPILE)
 def add_variation(planes, steps, rows, columns, gradient):
-    """Add factors times the sums of differences from the neighbours along rows and columns.
+    """Add differences from neighbouring texels, times the factors ``rows`` and ``columns``.
 
-    The texels of a row, and the channels of each, are one axis; neighbours are ``steps`` apart.
+    Texels of a row and their channels form one axis, on which neighbours are ``steps`` apart.
     """
     height = planes.shape[1]
     for task in prange(planes.shape[0] * height):

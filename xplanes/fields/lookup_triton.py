@@ -17,7 +17,7 @@ WIDE_TILE, NARROW_TILE = 512, 128
 one. With more, the backward pass runs out of registers."""
 
 WIDEST = 128
-"""Most channels of a program; the rest are spread along the second axis of the grid."""
+"""Maximum number of channels per program; the second axis of the grid covers all channels."""
 
 SIZES = ["count", "size", "timesteps", "width"]
 """Arguments for which triton compiles no variants, so that one trial covers all resolutions."""

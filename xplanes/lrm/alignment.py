@@ -33,8 +33,8 @@ def fit_cube(triplanes: Tensor, half_side: float, wanted: float) -> tuple[Tensor
         wanted: Half the side of the cube that they must contain.
 
     Returns:
-        The planes, and half the side of their cube: ``wanted``, rounded up to whole texels.
-        [T, 3, C, H', H']
+        The planes, and half the side of their cube: ``wanted``, at most `MOST` times as large as
+        before, rounded up to whole texels. [T, 3, C, H', H']
     """
     size = triplanes.shape[-1]
     texel = 2 * half_side / size

@@ -10,7 +10,7 @@ from xplanes.lrm.model import LRM
 from xplanes.lrm.weights import read_config
 
 FOLDER = Path(__file__).parent / "shipped"
-"""Folder of NAME.safetensors and NAME.json: weights, and configuration with their checksum."""
+"""Folder of NAME.safetensors (weights) and NAME.json (configuration, checksum of the weights)."""
 
 CHECKSUM = "weights_sha256"
 

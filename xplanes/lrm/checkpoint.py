@@ -26,7 +26,7 @@ class MismatchError(LRMError):
     """Weights do not match the model's sizes.
 
     Args:
-        message: What does not fit.
+        message: Description of the mismatch.
         fits: Names of the published models that they match.
     """
 

@@ -186,8 +186,8 @@ def parse_config(config: Mapping[str, Any]) -> LRMConfig:
         config: The content of the published config.json or config.yaml (OpenLRM 1.1, TripoSR) or
             of ``kwargs`` in model.pth (OpenLRM 1.0). The key ``architecture`` may name the family:
             openlrm-1.0, openlrm-1.1 or triposr. ``image_size``, ``image_mean`` and ``image_std``
-            may add what the published file lacks. OpenLRM models of other sizes or with another
-            camera use the keys ``encoder_sizes`` (img_size, patch_size, embed_dim, depth,
+            supply values that the published file lacks. OpenLRM models of other sizes or with
+            another camera use the keys ``encoder_sizes`` (img_size, patch_size, embed_dim, depth,
             num_heads, num_register_tokens), ``source_distance``, ``source_focal`` and
             ``density_scale``.
 

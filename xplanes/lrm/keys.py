@@ -2,7 +2,7 @@
 
 In a name, ``{i}`` is the index of a layer and ``{p}`` is weight or bias. ``{e}`` is the even index
 of a linear layer in a sequence that alternates with activations, and ``{h}`` is half of it. A
-published tensor with several names here is their concatenation along the first axis. None marks
+published tensor with several names here is split into these along the first axis. None marks
 tensors that a checkpoint may contain but the model does not need.
 """
 

@@ -27,7 +27,7 @@ PATIENCE_SECONDS = 0.8
 def answers(url: str) -> bool:
     """Whether a server, or the environment's proxy to it, accepts a connection in time.
 
-    Asked first because the hub's own client retries for half a minute.
+    Checked before a download, because the hub's own client retries for half a minute.
 
     Args:
         url: Address of the server, http or https.

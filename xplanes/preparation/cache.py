@@ -77,7 +77,7 @@ class StageCache:
         Args:
             name: Name of the stage, part of the file name.
             inputs: Everything that the result depends on: tensors, numbers, strings, lists, dicts.
-            make: Computes it: a dict of tensors and builtins.
+            make: Computes the result: a dict of tensors and builtins.
             keep: Whether to use the cache for this stage.
             alone: Whether other processes wait while one computes the same stage.
         """

@@ -41,8 +41,8 @@ def rendering_method(method: Method, views: Views, hints: CubeHints = NO_HINTS) 
 
     Args:
         method: The run's settings.
-        views: Training views; the model's published cube, near and far stay if they fit these.
-        hints: What is known of the scene's cube.
+        views: Training views; the model's published cube, near and far are kept if they fit.
+        hints: Known properties of the scene's cube.
     """
     name = method.preparation.fixed_view_model
     found = Method.read(compose_plain("train", [f"model={name}", "lrm=none"]))
@@ -270,7 +270,7 @@ def _rendered(
 
 
 def _budget(options: PreparationSettings) -> str:
-    """How long the field that renders the video is trained, for messages."""
+    """Training time of the field that renders the video, for messages."""
     steps, seconds = options.fixed_view_steps, options.fixed_view_seconds
     return f"{steps} steps" if seconds is None else f"up to {steps} steps or {seconds:g} s"
 
@@ -300,8 +300,8 @@ def trained_field(
         folder: Folder of its checkpoints.
         steps: Maximum number of training steps.
         seconds: Maximum training time in seconds; None for no limit.
-        advice: What to change when the loss is not finite: the settings of ``method`` are not the
-            user's.
+        advice: Advice to the user if the loss is not finite; the run's own settings differ from
+            ``method``.
 
     Raises:
         TrainingError: If the loss is not finite.

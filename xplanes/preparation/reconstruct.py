@@ -198,7 +198,7 @@ def align_to(video: FixedView, model: LRM, options: ImageLRMSettings) -> Alignme
 
 
 def picture_crop(frames: Tensor, *, crop: bool) -> Crop:
-    """One crop for all frames: around what is opaque in any of them, or the whole image.
+    """One crop for all frames: around pixels that are opaque in any frame, or the whole image.
 
     Args:
         frames: Premultiplied RGBA. uint8 [T, H, W, 4]

@@ -205,13 +205,13 @@ def from_sequence(
 def _settings_for(
     method: Method, sequence: TriplaneSequence, views: Views, *, source: str
 ) -> XPlanesSettings:
-    """The model's settings, with those that the sequence determines."""
+    """The model's settings, updated with those that the sequence determines."""
     frames, _, channels = sequence.triplanes.shape[:3]
     model = replace(cast(XPlanesSettings, method.model), channels=channels)
     if views.is_static or frames == 1:
         model = replace(model, plane_set="three")
     if model.plane_set != "three":
-        # The video has more timesteps than a few training views.
+        # The video may have more timesteps than the training views.
         model = replace(model, time_resolution=model.rows_of_time(views.times, frames))
     if sequence.decoder_config is not None:
         try:

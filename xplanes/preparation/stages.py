@@ -49,7 +49,7 @@ def parts_sheet(low_rank: Tensor, sparse: Tensor, timesteps: int = 4, side: int 
     tiles = F.interpolate(both.clamp(0, 1).flatten(0, 2), size=(side, side), mode="nearest")
     tiles = F.pad(tiles, (2, 2, 2, 2), value=1.0)
     size = side + 4
-    # [timestep, part, orientation, colour, row, column] to orientations below one another
+    # [timestep, part, orientation, colour, row, column], with orientations below one another.
     sheet = tiles.view(len(chosen), 2, 3, 3, size, size).permute(2, 4, 0, 1, 5, 3)
     return sheet.reshape(3 * size, len(chosen) * 2 * size, 3)
 
@@ -111,8 +111,8 @@ def decompose_stage(
 
     Returns:
         The static part ``low_rank`` and the dynamic part ``sparse`` [T, 3, C, H, H] on the CPU, and
-        ``report``, for each of "xy", "xz" and "yz" the entries of `REPORTED`. Of a single triplane
-        ``sparse`` is None and the report empty.
+        ``report``, the entries of `REPORTED` for each of "xy", "xz" and "yz". For a single triplane
+        ``sparse`` is None and the report is empty.
     """
     triplanes = triplanes.float()
     options = {
@@ -164,10 +164,10 @@ def convert_stage(
         device: Device of the computation.
 
     Returns:
-        The planes ``space`` [3, R, R, C] and ``time`` [P, Rt, R, C], on the CPU; and as
-        ``unexplained`` the share of the sparse part's energy that products of time planes do not
-        explain: ``before`` for random planes, ``after`` for these. Without time planes ``time`` is
-        None and ``unexplained`` empty.
+        The planes ``space`` [3, R, R, C] and ``time`` [P, Rt, R, C], on the CPU, and
+        ``unexplained``, the share of the sparse part's energy that products of time planes do not
+        explain: ``before`` for random planes, ``after`` for the returned ones. Without time planes,
+        ``time`` is None and ``unexplained`` is empty.
     """
     moving = model.plane_set != "three"
     sparse = parts.content["sparse"] if moving else None

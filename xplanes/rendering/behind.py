@@ -14,7 +14,7 @@ DARK = 1e-3
 """Transmittance of the field below which a ray's background is not computed."""
 
 Ends = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Maps origins and directions to the distances at which rays enter and leave a box: `ray_box`.
+"""Maps ray origins and directions to entry and exit distances for a box, as `ray_box` does.
 
 [R, 3], [R, 3] -> [R], [R]
 """
@@ -29,7 +29,7 @@ def behind(
     jitter: Tensor | None = None,
     ends: Ends = ray_box,
 ) -> Tensor:
-    """Colours behind a field: of its learnt background if it has one, else a constant colour.
+    """Colours behind a field: its learnt background if it has one, else a constant colour.
 
     Args:
         field: A field whose ``background`` is a `Background`, None or missing.

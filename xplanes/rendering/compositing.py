@@ -24,10 +24,10 @@ def composite(
 ) -> tuple[Tensor, Tensor]:
     """Composite the samples of each ray (Beer-Lambert law).
 
-    ``w_i = exp(-sum_{j<i} tau_j) (1 - exp(-tau_i))`` within each ray, from sums of optical depths,
-    so that no depth from 0 to the largest number gives a NaN or an infinity. A depth that is NaN
-    makes its ray NaN. Gradients reach depths and colours. Computed by compiled loops on the CPU, by
-    Triton kernels on CUDA if they pass their trial, and otherwise by `composite_reference`.
+    Each ray has weights ``w_i = exp(-sum_{j<i} tau_j) (1 - exp(-tau_i))``, from sums of optical
+    depths: no finite depth of at least 0 gives NaN or infinity. A NaN depth makes its ray NaN.
+    Gradients reach depths and colours. Computed by compiled loops on the CPU, by Triton kernels on
+    CUDA if they pass their trial, and otherwise by `composite_reference`.
 
     Args:
         optical_depth: Density times length of each sample; samples of a ray are contiguous, from

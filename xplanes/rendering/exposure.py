@@ -1,8 +1,8 @@
-"""Exposures of training cameras that differ: a gain per colour channel of each, learnt in training.
+"""Exposure matching: a learnt gain per training camera and colour channel.
 
-Cameras choose exposure and white balance for each photo, and those of a rig are not alike. A field
-that must agree with all of them turns the differences into fog or blurs texture. Images are
-rendered with the mean exposure of the training cameras.
+Cameras choose exposure and white balance for each photo, and the cameras of a rig differ. A field
+trained on all of them turns these differences into fog or blurs texture. Images are rendered with
+the mean exposure of the training cameras.
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ RATE, PULL = 0.01, 0.003
 
 
 class ExposureSampler(WrappingSampler):
-    """Another sampler of rays, whose colours are multiplied by a gain of the ray's camera.
+    """Wraps a sampler of rays and multiplies its colours by the gains of each ray's camera.
 
     Args:
         inner: The sampler.
@@ -71,14 +71,14 @@ class Exposures(nn.Module):
         groups: The training cameras.
 
     Attributes:
-        logarithms: Logarithms of the gains, up to a common one. [C, 3]
+        logarithms: Logarithms of the gains, up to an offset common to all cameras. [C, 3]
     """
 
     index: Tensor
 
     def __init__(self, groups: CameraGroups) -> None:
         super().__init__()
-        # Known wherever the field is built.
+        # Not stored in checkpoints: known whenever the field is built.
         self.register_buffer("index", groups.index, persistent=False)
         self.logarithms = nn.Parameter(torch.zeros(len(groups.places), 3))
 

@@ -29,11 +29,11 @@ def fill(
     step: float,
     generator: torch.Generator,
 ) -> None:
-    """Keep cells where the field has density, and cells where the images show that it lacks some.
+    """Keep cells where the field has density, or where the images show that density is missing.
 
-    If the ray of a foreground pixel meets no remaining cell, the field misses something there, and
-    all cells along that ray are restored. One pixel is tested per image square that is at most as
-    wide as a cell, and all pixels of squares whose neighbours give another result.
+    If the ray of a foreground pixel meets no remaining cell, density is missing along this ray, and
+    all of its cells are restored. One foreground pixel is tested in each image square, which is at
+    most as wide as a cell; all of them are tested where neighbouring squares differ.
 
     Args:
         grid: Changed in place; empty cells stay empty.
@@ -106,7 +106,7 @@ def one_of_each_square(mask: Tensor, side: int) -> Tensor:
 
 
 def differing(values: Tensor) -> Tensor:
-    """Where an image is above 0 and differs among the pixel and its neighbours. bool [H, W]"""
+    """Pixels that are above 0 and differ from one of their neighbours. bool [H, W]"""
     most, least = (F.max_pool2d(sign * values[None], 3, 1, 1)[0] * sign for sign in (1, -1))
     return (values > 0) & (most != least)
 

@@ -1,4 +1,4 @@
-"""Equal steps through occupied cells: rendering, and the occupancy grid in training."""
+"""Ray marching in equal steps through occupied cells, with updates of the occupancy grid."""
 
 import math
 import time
@@ -34,10 +34,10 @@ STEP_OF_ROOM = 1024
 """The number of slots is a multiple of this."""
 
 FEWEST_SAMPLES, SAMPLES_PER_PIXEL = 128, 0.5
-"""Samples along the diagonal: at least, and per image pixel along the cube's side."""
+"""Minimum number of samples along the diagonal; samples per image pixel along the cube's side."""
 
 BINS, MOST_BINS = 8, 16
-"""Bins of the grid along time with time_bins=auto: usually, and at most."""
+"""Usual and maximum number of time bins of the grid with time_bins=auto."""
 
 SPARSE_POINTS = 2048
 """Points at which the sparsity prior is evaluated."""
@@ -284,7 +284,7 @@ class OccupancySettings(SamplerSettings):
         return OccupancySampler(renderer, settings, site.samples_per_batch, fill_seconds)
 
     def with_constant_background(self, site: Site) -> "OccupancySettings":
-        """Settings for a constant background: sweeps scaled to the batch size of a site.
+        """Settings for a constant background: sweeps scaled to the batch size, no distortion loss.
 
         Updates of random cells are not scaled, because large batches reach more cells anyway.
         """
@@ -296,7 +296,7 @@ class OccupancySettings(SamplerSettings):
         )
 
     def with_learnt_background(self) -> "OccupancySettings":
-        """Settings for a learnt background: cells are not emptied early in training."""
+        """Settings for a learnt background: no early emptying of cells and no sparsity prior."""
         return replace(self, sweep_at=self.sweep_at[-1:], sparsity=0.0)
 
     def for_video(self) -> "OccupancySettings":
@@ -372,7 +372,7 @@ class OccupancySampler(Sampler):
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
         training = self._training
-        # Elsewhere the slots for samples would not follow when their number doubles.
+        # On a GPU the number of slots would not follow when the number of samples doubles.
         on_cpu = self.device.type == "cpu"
         if on_cpu and self.settings.coarse_first and state.step < self.pruned_at:
             training = replace(training, samples=training.samples // 2)
@@ -428,7 +428,7 @@ class OccupancySampler(Sampler):
         points, times = self.grid.occupied_points(uniform.float())
         density = field(points, times)[1]
         opacity = -torch.expm1(-self._training.step * density)
-        # Needed even if no cell is occupied: other processes wait for the gradients.
+        # Computed even if no cell is occupied: other processes wait for the gradients.
         return steps * self.settings.sparsity / SPARSE_POINTS * opacity.sum()
 
     @property
@@ -453,7 +453,7 @@ class OccupancySampler(Sampler):
             self.grid.update(field, settings.update_cells, generator)
 
     def _agree(self) -> None:
-        """Copy the first process's grid to all: each has observed only its own samples."""
+        """Copy the first process's grid to all, since each has observed only its own samples."""
         if distributed.is_available() and distributed.is_initialized():
             for part in (self.grid.density, self.grid.least, self.grid.occupied):
                 distributed.broadcast(part, src=0)

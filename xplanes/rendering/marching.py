@@ -51,12 +51,12 @@ class Samples:
         candidates: Number of samples in the box before any were dropped.
         empty: Samples dropped because their cell is empty.
         occluded: Samples dropped because an opaque surface lies in front.
-        live: With a fixed number of slots: which of them hold a sample; None if all do. [N]
-        number: Number of slots that hold a sample. []
-        shown: Rays whose samples fit the slots; None if all did. [R]
+        live: Whether each slot holds a sample; None unless the number of slots is fixed. [N]
+        number: Number of slots that hold a sample; None if ``live`` is. []
+        shown: Rays whose samples fit the slots; None if ``live`` is. [R]
 
-    With ``live`` the other counts are tensors, too; unused slots come last, with points outside the
-    cube.
+    If the number of slots is fixed, the counts are tensors. Unused slots come last, with points
+    outside the cube.
     """
 
     ray: Tensor
@@ -177,7 +177,7 @@ def march_into(
 ) -> Samples:
     """`march_reference` with a fixed number of slots, without waiting for the device.
 
-    Samples are counted; each slot finds its sample from the cumulative sum of the counts.
+    Each slot finds its sample by a binary search in the cumulative number of samples.
     """
     origins, directions, *_ = rays
     near, far = ray_box(origins, directions)
@@ -223,7 +223,7 @@ def march_gpu(
     limit: float,
     room: int | None,
 ) -> Samples:
-    """`march_into`, or without ``room`` `march_reference`, as a Triton kernel.
+    """`march_into`, or `march_reference` if ``room`` is None, as a Triton kernel.
 
     The kernel runs twice: to count the samples of each ray, and to write them.
     """
@@ -296,7 +296,7 @@ def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
 
 def _starts(ray: Tensor, rays: int) -> Tensor:
     """Index of each ray's first sample. [N] -> [rays]"""
-    # Unlike a count, a binary search does not wait for the device.
+    # Unlike ``bincount``, a binary search does not wait for the device.
     return torch.searchsorted(ray, torch.arange(rays, device=ray.device))
 
 

@@ -1,8 +1,8 @@
 """Triton kernels that place samples along rays on CUDA; the reference is in `marching`.
 
 A program handles one ray, a block of positions at a time: first to count its samples, and again to
-write them once the offsets of all rays are known. Both passes get the same numbers, since no
-product is fused with a sum. Imported only when needed, since triton takes a while to load.
+write them once the offsets of all rays are known. Both passes get the same numbers, since
+fused multiply-add is disabled. Imported only when needed, since triton takes a while to load.
 """
 
 # ruff: noqa: D103 (the callers in marching.py document these kernels)
@@ -50,7 +50,7 @@ def load_ray(origins, directions, ray):
 
 @triton.jit
 def ray_box(origin, direction):
-    """Distances at which a ray enters and leaves the cube; 0 and 0 if it does not."""
+    """Distances at which a ray enters and leaves the cube; both are 0 if it misses."""
     x0, x1 = slab(origin[0], direction[0])
     y0, y1 = slab(origin[1], direction[1])
     z0, z1 = slab(origin[2], direction[2])
@@ -182,7 +182,7 @@ def launch(rays, grid, spacing, counts, room, found=None):
         rays: Origins, directions, times and jitter.
         grid: Occupied cells (None: all), least densities, resolution and time bins.
         spacing: Distance between positions and largest optical depth in front, float64 [] each.
-        counts: Positions in the cube, those in occupied cells, and those not occluded. int64 [3, R]
+        counts: Numbers of positions in the cube, in occupied cells, and unoccluded. int64 [3, R]
         room: Number of slots.
         found: Starts [R], and the outputs: ray, distances, cells, points [N, ...].
     """

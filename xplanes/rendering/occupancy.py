@@ -17,9 +17,9 @@ class OccupancyGrid(nn.Module):
     """A decaying maximum of the field's density per cell of the cube [-1, 1]^3 and time bin.
 
     A cell is occupied while the opacity of its density over one sample step is above ``threshold``.
-    Cells are initially occupied; each observation of a lower density multiplies theirs by
-    ``decay``. Cells that are not ``allowed`` (outside the silhouettes) stay empty; those that are
-    not ``likely`` can become occupied only next to an occupied cell.
+    All cells are initially occupied; an observation lowers the density of its cell by the factor
+    ``decay`` at most. Cells that are not ``allowed`` (outside the silhouettes) stay empty; cells
+    that are not ``likely`` can become occupied only next to an occupied cell.
 
     ``least`` is a running minimum of the observed densities: it falls at once and rises slowly. A
     cell that a surface crosses, or that is filled at only some times of its bin, has a high density
@@ -91,9 +91,9 @@ class OccupancyGrid(nn.Module):
         torch.gt(self.density, self.empty_density, out=self.occupied)
 
     def occupied_cells(self) -> Tensor:
-        """Numbers of all occupied cells, ascending. int64 [N]"""
+        """Indices of all occupied cells, ascending. int64 [N]"""
         if self.occupied.device.type == "cpu":
-            # Up to ten times as fast as PyTorch's.
+            # Up to ten times as fast as PyTorch's ``nonzero``.
             return torch.from_numpy(np.flatnonzero(self.occupied.numpy()))
         return self.occupied.nonzero()[:, 0]
 
@@ -109,7 +109,7 @@ class OccupancyGrid(nn.Module):
         Args:
             cells: Cell of each sample. [N]
             density: Density there. [N]
-            live: Which samples count, a prefix of them; all when None. [N]
+            live: Whether each sample is used, used ones first; all are used when None. [N]
         """
         density = self._usable(density)
         if live is None and cpu_loops(self.density):
@@ -119,8 +119,8 @@ class OccupancyGrid(nn.Module):
             cpu.observe_cells(*(array.numpy() for array in arrays), *numbers)
             return
         if live is not None:
-            # The others repeat those that count, without effect. They repeat different ones, as
-            # writes to a single cell would be serialised.
+            # Unused samples repeat used ones, which has no effect. They repeat different ones,
+            # because writes to a single cell would be serialised.
             one = torch.arange(len(live), device=live.device) % live.sum().clamp_min(1)
             cells = torch.where(live, cells, cells[one])
             density = torch.where(live, density, density[one])
@@ -212,9 +212,10 @@ class OccupancyGrid(nn.Module):
         self.observe(cells, field(points, times)[1], counted)
 
     def occupied_points(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
-        """Random points and times in occupied cells; none if all cells are empty.
+        """Random points and times in occupied cells.
 
-        On a GPU the host does not wait for the number of occupied cells.
+        If all cells are empty, the CPU returns no points. The GPU, for which the host does not wait
+        for the number of occupied cells, returns points in the last cell.
 
         Args:
             uniform: Random numbers from 0 to 1 for cell, position along each axis, and time. [N, 5]
@@ -233,7 +234,7 @@ class OccupancyGrid(nn.Module):
         return self.draw(cells, uniform[:, 1:])
 
     def _near_occupied(self, count: int, generator: torch.Generator) -> Tensor:
-        """Random cells of the same time within one step of an occupied one, along each axis."""
+        """Random cells at most one cell from an occupied one along each axis, in its time bin."""
         device = self.density.device
         cells = self.occupied_cells()
         if not len(cells):
@@ -250,7 +251,7 @@ class OccupancyGrid(nn.Module):
         return cells
 
     def _beside_occupied(self, cells: Tensor) -> Tensor:
-        """Whether a cell or one that shares a face with it is occupied. bool [N]"""
+        """Whether a cell or one of its face neighbours is occupied. bool [N]"""
         size = self.resolution
         found = self.occupied[cells]
         for stride in (1, size, size**2):
@@ -261,7 +262,7 @@ class OccupancyGrid(nn.Module):
         return found
 
     def _usable(self, density: Tensor) -> Tensor:
-        """Densities clamped to opaque in one step, so that cells can decay; NaN becomes 0."""
+        """Densities clamped to ``opaque_density``, so that cells can decay; NaN becomes 0."""
         return density.float().nan_to_num(0.0).clamp_max(self.opaque_density)
 
     def draw(self, cells: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:

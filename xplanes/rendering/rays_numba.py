@@ -13,7 +13,7 @@ from xplanes.backend import njit
 COMPILE = {"nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
 
 EXACT = {**COMPILE, "fastmath": False}
-"""For loops that must reproduce the same numbers: a fused multiply-add rounds differently."""
+"""Options for loops that must reproduce the same numbers: fused multiply-add rounds differently."""
 
 
 @njit(inline="always", **EXACT)
@@ -103,7 +103,7 @@ def fill_samples(
 
 @njit(**EXACT)
 def observe_cells(cells, observed, allowed, density, least, occupied, decay, trust, empty):
-    """Densities observed in cells of the grid; several in a cell count as their maximum."""
+    """Update cells from densities: from the maximum per cell, and ``least`` from the minimum."""
     highest, lowest = np.empty_like(observed), np.empty_like(observed)
     for n in range(len(cells)):
         cell = cells[n]

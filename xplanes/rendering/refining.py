@@ -1,15 +1,14 @@
 """Corrects the poses of training cameras while a field is trained on their images.
 
-An image and its rendering from a pose that is slightly wrong are displaced. To first order the
-difference of their colours is the image's gradient times the displacement of its pixels, which the
-rays' depths turn into a motion of the camera (Lucas and Kanade, 1981, in three dimensions). Each
-batch adds its rays to the normal equations of these motions, and every few steps they are solved
-(Gauss-Newton). No gradient with respect to positions is needed, so that any field and any sampler
-of rays will do.
+If a pose is slightly wrong, the rendering is displaced from the image. To first order, their
+colours differ by the image gradient times the displacement, from which the depths of the rays give
+the motion of the camera (Lucas and Kanade, 1981, in three dimensions). Each batch adds its rays to
+the normal equations of these motions, which are solved every few steps (Gauss-Newton). This needs
+no gradient with respect to positions, so that it works with any field and any sampler of rays.
 
-A motion of all cameras together, and a scale, can be undone by the field: they are removed. What
-remains is damped, and pulled towards the poses that were given, as the data are weak along some
-motions: a camera far away may come nearer without any change of its image.
+A motion and a scale common to all cameras are removed, because the field can undo them. Corrections
+are damped and pulled towards the given poses, because the data are weak along some motions: the
+image of a distant camera hardly changes when it moves closer.
 """
 
 from typing import Any
@@ -30,10 +29,10 @@ EVERY = 50
 """Steps between corrections."""
 
 DAMPING, PULL = 0.01, 0.03
-"""Weights of a correction and of the distance from the given pose, beside the image's gradients."""
+"""Weights of a correction and of the distance from the given pose, per mean squared gradient."""
 
 LEAST_MOTION = 0.01
-"""Part of the mean weight of turns, or shifts, that directions without evidence have at least."""
+"""Share of the mean weight of turns, or of shifts, that is added to every direction's weight."""
 
 LARGEST = 1.0
 """Largest correction at a time, in pixels."""
@@ -42,14 +41,14 @@ LEAST_RAYS = 100.0
 """Rays that a camera needs to be corrected, weighted by opacity."""
 
 LEAST_AREA = 1e-3
-"""Least square of the sine between the changes of a direction by a pixel to the right and down."""
+"""Minimum squared sine of the angle between a direction's changes per pixel right and down."""
 
 BEHIND = 3.0
-"""Assumed distance of surroundings from the centre of the cube, in halves of its side."""
+"""Assumed distance of the surroundings from the cube's centre, in units of half its side."""
 
 
 class RefiningSampler(WrappingSampler):
-    """Another sampler of rays, with poses that are corrected.
+    """Wraps a sampler of rays and corrects the poses of the training cameras.
 
     Args:
         inner: The sampler.
@@ -101,7 +100,7 @@ class CameraCorrections(nn.Module):
 
     Attributes:
         motion: Turn about the camera's own position, as a rotation vector, then shift. [C, 6]
-        moved: Root mean square displacement of what each camera sees, in pixels. [C]
+        moved: Root mean square displacement of each camera's image, in pixels. [C]
     """
 
     index: Tensor
@@ -116,7 +115,7 @@ class CameraCorrections(nn.Module):
     def __init__(self, groups: CameraGroups) -> None:
         super().__init__()
         count, exact = len(groups.places), torch.float64
-        # Known wherever the field is built.
+        # Not stored in checkpoints: known whenever the field is built.
         self.register_buffer("index", groups.index, persistent=False)
         self.register_buffer("places", groups.places, persistent=False)
         self.register_buffer("motion", torch.zeros(count, 6))
@@ -166,7 +165,7 @@ class CameraCorrections(nn.Module):
         area = across * along - both.square()
         to_pixels = torch.stack([along * right - both * down, across * down - both * right], dim=1)
         to_pixels /= area[..., None]
-        # A lens may map no direction to the next pixel, and a field may fail.
+        # A lens may have no ray for the next pixel, and a field may return NaN.
         usable = (difference.isfinite().all(dim=-1) & inverse.isfinite())[:, None]
         usable &= area > LEAST_AREA * across * along
         difference = torch.where(usable, difference, 0)
@@ -187,7 +186,7 @@ class CameraCorrections(nn.Module):
 
     @torch.no_grad()
     def solve(self) -> None:
-        """Correct the cameras by what was observed since the last time, and forget it."""
+        """Correct the cameras from the observations since the last correction, and clear these."""
         sums = (self.steepness, self.residual, self.pixels, self.rays)
         if distributed.is_available() and distributed.is_initialized():
             for each in sums:  # Each process has its own rays.
@@ -232,7 +231,7 @@ def rotations(vectors: Tensor) -> Tensor:
 
 
 def without_common(places: Tensor, motion: Tensor, metric: Tensor, known: Tensor) -> Tensor:
-    """Motions of cameras without what a motion and a scale of the whole scene would undo.
+    """Camera motions without the part that a motion and a scaling of the whole scene would undo.
 
     Args:
         places: Positions of the cameras. [C, 3]
@@ -241,7 +240,7 @@ def without_common(places: Tensor, motion: Tensor, metric: Tensor, known: Tensor
         known: Cameras that count. bool [C]
 
     Returns:
-        The smallest motions that differ by a common one; others as they were. [C, 6]
+        The smallest motions that differ by a common one; unchanged if not ``known``. [C, 6]
     """
     if not known.any():
         return motion
@@ -253,7 +252,7 @@ def without_common(places: Tensor, motion: Tensor, metric: Tensor, known: Tensor
     common = torch.cat([turned, shifted], dim=1)
     weighted = common[known].mT @ metric[known]
     left, right = weighted @ common[known], weighted @ motion[known, :, None]
-    # Few cameras do not determine all of it.
+    # The pseudoinverse, since few cameras do not determine the whole common motion.
     found = torch.linalg.pinv(left.sum(dim=0), hermitian=True) @ right.sum(dim=0)
     return torch.where(known[:, None], motion - (common @ found)[..., 0], motion)
 
@@ -266,7 +265,7 @@ def _cross(vectors: Tensor) -> Tensor:
 
 
 def _floored(metric: Tensor) -> Tensor:
-    """A quadratic form of turn and shift with a least weight of every direction. [C, 6, 6]"""
+    """A quadratic form of turn and shift, plus a minimum weight for every direction. [C, 6, 6]"""
     weights = metric.diagonal(dim1=1, dim2=2).view(-1, 2, 3).mean(dim=-1)
     least = (LEAST_MOTION * weights).clamp(min=1e-12).repeat_interleave(3, dim=1)
     return metric + torch.diag_embed(least)

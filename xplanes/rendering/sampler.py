@@ -28,7 +28,7 @@ from xplanes.streams import TrainingState
 logger = logging.getLogger(__name__)
 
 VIEWS_PER_ROW = 4
-"""Views of a timestep needed for it to have its own row of the time planes."""
+"""Views that a timestep needs to have its own row of the time planes."""
 
 Group = dict[str, Any]
 """A parameter group of the optimiser: ``params``, ``lr`` and ``name``."""
@@ -99,8 +99,8 @@ class Site:
 def time_rows(times: Tensor) -> int:
     """Default number of rows of the time planes.
 
-    One per two distinct times, or one per time if each has enough views to be determined without
-    its neighbours.
+    One per two distinct times, or up to one per time if there are `VIEWS_PER_ROW` views per row; at
+    least 2.
 
     Args:
         times: Time of each training view. [V]
@@ -188,10 +188,10 @@ class Sampler(ABC):
 
 
 class WrappingSampler(Sampler):
-    """Base class of samplers that change what another one renders.
+    """Base class of samplers that wrap another one.
 
     Args:
-        inner: The other sampler; what a derived class does not override is left to it.
+        inner: The wrapped sampler; methods that are not overridden are delegated to it.
     """
 
     def __init__(self, inner: Sampler) -> None:
@@ -322,7 +322,7 @@ def origin_cube(half_side: float, views: Views, hints: CubeHints = NO_HINTS) -> 
     Args:
         half_side: Half the side of the cube, in world units.
         views: Training views.
-        hints: What is known of the scene's cube; the user must not have set any of it.
+        hints: Known properties of the scene's cube; the user must not have set its side or centre.
 
     Raises:
         ConfigError: If the user has set the scene's cube as well.

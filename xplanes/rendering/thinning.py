@@ -20,8 +20,8 @@ def thinned(
     nine tenths of the gradient. A sample whose gradient size is below a level, ``thinning`` times
     the mean, is kept with probability size / level, and its gradient is multiplied by level / size.
     The result is unbiased, and the backward pass evaluates the field for the kept samples only. The
-    size is the sum of the gradients of the colour and of the logarithm of the density, which are
-    those at the field's last layer.
+    gradient size is the sum of the norms of the gradients with respect to colour and log density,
+    which approximate those at the field's last layer.
 
     Args:
         shade: The field at the samples.
@@ -54,7 +54,7 @@ class _Thinned(torch.autograd.Function):
         to_colour, to_density = gradients
         (density,) = ctx.saved_tensors
         size = to_colour.norm(dim=1) + (to_density * density).abs()
-        # With a level that is not finite all samples are kept, so that training detects the cause.
+        # If the level is not finite, all samples are kept, so that training detects the cause.
         level = (ctx.thinning * size.mean()).nan_to_num(0.0, 0.0, 0.0)
         draw = torch.rand(size.shape, generator=ctx.generator, dtype=size.dtype)
         # The negated comparison also keeps samples whose size is NaN.

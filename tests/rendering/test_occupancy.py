@@ -373,3 +373,23 @@ def test_looks_by_given_numbers_reach_the_same_cells():
     share = counted[asked] / counted[asked].sum()
     torch.testing.assert_close(share, plain[asked] / plain[asked].sum(), atol=0.004, rtol=0.2)
     assert (plain > 0).sum() > 20
+
+
+@pytest.mark.parametrize("by_numbers", [False, True])
+def test_looks_never_fill_cells_that_must_stay_empty(by_numbers):
+    grid = grid_of(resolution=6, bins=1)
+    corner = torch.zeros(1, 6, 6, 6, dtype=torch.bool)
+    corner[0, :2, :2, :2] = True
+    grid.presume(corner)
+    near = torch.zeros(6, 6, 6, dtype=torch.bool)
+    near[:2, :2, :2] = near[2, :2, :2] = near[:2, 2, :2] = near[:2, :2, 2] = True
+    for step in range(20):
+        before = grid.density.clone(), grid.occupied.clone()
+        if by_numbers:
+            uniform = counted_uniform(0, step, 1, (64, 8), torch.device("cpu"))
+            grid.update_by(constant(100.0), uniform)
+        else:
+            grid.update(constant(100.0), 64, generator(step))
+        assert not (grid.occupied.view(6, 6, 6) & ~near).any()
+        grid.density.copy_(before[0])
+        grid.occupied.copy_(before[1])

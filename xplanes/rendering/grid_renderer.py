@@ -445,9 +445,9 @@ class OccupancySampler(Sampler):
         generator = step_generator(state.seed, step, Stream.GRID)
         if sweeping:
             self.grid.sweep(field, generator)
-        elif (device := self.grid.density.device).type != "cpu":
+        elif self.device.type != "cpu":
             shape = (settings.update_cells, 8)
-            uniform = counted_uniform(state.seed, step, Stream.GRID, shape, device)
+            uniform = counted_uniform(state.seed, step, Stream.GRID, shape, self.device)
             self.grid.update_by(field, uniform)
         else:
             self.grid.update(field, settings.update_cells, generator)

@@ -208,6 +208,8 @@ class OccupancyGrid(nn.Module):
         anywhere = (chosen[count // 2 :] * total).long()
         cells = torch.cat([anywhere, beside])
         counted = self.allowed[cells] & (self.likely[cells] | self._beside_occupied(cells))
+        order = counted.to(torch.uint8).argsort(stable=True, descending=True)
+        cells, counted = cells[order], counted[order]
         points, times = self.draw(cells, uniform[:, 4:].float())
         self.observe(cells, field(points, times)[1], counted)
 

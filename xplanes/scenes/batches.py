@@ -1,4 +1,4 @@
-"""Stateless training batches: each depends only on the seed, the step and the rank."""
+"""Stateless training batches: the seed, the step and the rank determine all randomness."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ CPU_RAYS, CPU_SAMPLES = 1365, 8192
 """Largest batch on the CPU with per_batch=auto; schedules in steps assume this size."""
 
 SLOPES_OVER = 2
-"""Distance in pixels over which slopes of images are taken; the nearest pixels are noisier."""
+"""Spacing in pixels of the Sobel filter for image gradients; adjacent pixels are noisier."""
 
 GPU_RAYS, GPU_SAMPLES = 2**15, 2**19
 """Largest batch on a GPU with per_batch=auto; small batches would leave it idle."""
@@ -59,7 +59,7 @@ class Batches(ABC):
     Attributes:
         views: Training views.
         rays: Number of rays per batch.
-        skipped: Share of the rays of uniform sampling that are not drawn.
+        skipped: Share of the rays that go to other pixels than with uniform sampling.
     """
 
     views: Views
@@ -67,10 +67,10 @@ class Batches(ABC):
     skipped: float
 
     def add_slopes(self) -> None:
-        """Add to each batch what the refinement of cameras needs, see `RayBatches.slopes`.
+        """Add the gradients for the refinement of cameras to each batch, see `RayBatches.slopes`.
 
         Raises:
-            ConfigError: If these batches cannot.
+            ConfigError: If these batches do not support it.
         """
         raise ConfigError(
             "data.refine_cameras=true: this model trains on whole views, but cameras are refined "
@@ -98,7 +98,7 @@ class BatchSettings(Settings, ABC):
 
     @property
     def matches_exposure(self) -> bool:
-        """Whether a gain of each training camera is learnt, where images show surroundings."""
+        """Whether a gain is learnt for each training camera, if images show surroundings."""
         return False
 
     @property
@@ -119,12 +119,12 @@ class BatchSettings(Settings, ABC):
             views: Training views.
             frame: The field's frame.
             seed: The run's seed.
-            rank: Rank of the process among those that split the rays.
+            rank: Rank of the process among the processes that split the rays.
         """
 
     @abstractmethod
     def fitting(self, rays: int, samples: int) -> int:
-        """Rays of the next batch, given the rays and samples of the last one."""
+        """Number of rays in the next batch, given the rays and samples of the last one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,7 +170,7 @@ class RaySettings(BatchSettings):
         return RayBatches(views, frame, self, seed=seed, rank=rank)
 
     def fitting(self, rays: int, samples: int) -> int:
-        """Rays that keep the number of samples near its maximum."""
+        """Number of rays that keeps the number of samples near its maximum."""
         room = self.most_samples * rays / max(1, samples)
         return max(64, min(self.most, int(room)))
 
@@ -218,8 +218,8 @@ class ViewBatches(Batches):
 
         Returns:
             Its ``camera``, and for each pixel, row by row: ``times`` [R], ``target`` colour on
-            ``background`` [R, 3] each, and ``alpha`` [R]. If some pixels are ignored, also
-            ``shown``, those that are not. bool [R]
+            ``background`` [R, 3] each, and ``alpha`` [R]. If some pixels are not trained on, also
+            ``shown``: whether each pixel is. bool [R]
         """
         turn, place = divmod(step, len(self.views))
         generator = step_generator(self.seed, turn, self.stream)
@@ -243,29 +243,29 @@ class ViewBatches(Batches):
 class RayBatches(Batches):
     """Draws training rays as a function of (seed, step, rank).
 
-    With ``skip_background``, pixels far from the silhouettes get ``background_share`` of the rays
-    instead of their share of the pixels. They show only background, and a few rays suffice to
-    prevent floaters. Space along rays with alpha 0 also counts as empty at slightly earlier and
-    later times. Opaque pixels without texture, such as those of a white floor, get
-    `TEXTURELESS_SHARE`. In opaque images of fixed cameras, pixels that change take the role of
-    silhouettes: the others get `STATIC_SHARE`, at their own times.
+    With ``skip_background``, at most ``background_share`` of the rays go to pixels far from the
+    silhouettes. These show only background, and a few rays suffice to prevent floaters. Far rays
+    with alpha 0 get slightly earlier or later times, at which their space is also taken for empty.
+    At most `TEXTURELESS_SHARE` go to opaque pixels without texture, such as those of a white floor.
+    In opaque images of fixed cameras, changing pixels take the role of silhouettes: at most
+    `STATIC_SHARE` of the rays go to static pixels, without changed times.
 
-    From images in files, each batch takes `PER_RUN` pixels from each of a few runs of consecutive
-    pixels, so that it reads from few places on the disk; all pixels remain equally likely. Near and
-    far are distinguished more coarsely there (`RunPools`).
+    From images in files, each batch takes up to `PER_RUN` pixels from each of a few runs of
+    consecutive pixels, so that it reads from few places on the disk; pixels of a kind remain
+    equally likely. Near and far are distinguished more coarsely there (`RunPools`).
 
     Args:
         views: Training views.
         frame: The field's frame, in which rays are returned.
         settings: The settings.
         seed: The run's seed.
-        rank: Rank of this process among those that split the rays.
+        rank: Rank of this process among the processes that split the rays.
 
     Attributes:
-        slopes: Whether batches have ``view``, the index of each ray's view, int64 [R]; ``across``,
-            the changes of its direction by one pixel to the right and down, [R, 2, 3]; and
-            ``slopes``, those of the target colour by smoothed differences (Sobel), [R, 3, 2].
-        tiles: Tiles of the images by which rays are preferred; None without importance sampling.
+        slopes: Whether batches have ``across``, the change of each ray's direction by one pixel to
+            the right and down, [R, 2, 3], and ``slopes``, the change of the target colour per pixel
+            in the same directions (Sobel filter), [R, 3, 2].
+        tiles: Image tiles whose errors guide importance sampling; None without it.
     """
 
     slopes = False
@@ -285,7 +285,7 @@ class RayBatches(Batches):
         else:
             self.tiles = Tiles.of(views) if self.error_share else None
             if settings.skip_background and views.is_opaque:
-                changes = changing(views, margins)  # Large captures are sampled uniformly.
+                changes = changing(views, margins)  # Opaque images in files are sampled uniformly.
             skips_textureless = settings.skip_background and changes is None
             self.pools = PixelPools(
                 foreground(views, margins) if changes is None else changes,
@@ -326,10 +326,10 @@ class RayBatches(Batches):
 
         Returns:
             ``origins`` and unit ``directions`` in the field's frame [R, 3], ``times`` [R],
-            ``target`` colour on ``background`` [R, 3] each, its ``alpha`` [R], ``jitter`` from 0
-            to 1 [R], and its ``view``, int64 [R]. With `tiles`, also ``tile``, the number of each
-            pixel's tile, int64 [R], and with ``errors`` the rays' ``weight`` in the loss [R]. More
-            with `slopes`.
+            ``target`` colour on ``background`` [R, 3] each, its ``alpha`` [R], ``jitter`` of the
+            samples from 0 to 1 [R], and the index of its ``view``, int64 [R]. With `tiles`, also
+            ``tile``, the number of each pixel's tile, int64 [R], and with ``errors`` the rays'
+            ``weight`` in the loss [R]. `slopes` adds further entries.
         """
         rays = rays or self.rays
         errors = None if self.tiles is None else errors
@@ -356,7 +356,7 @@ class RayBatches(Batches):
     def _served(
         self, drawn: tuple[Tensor, ...], background: Tensor, move: Tensor | None, jitter: Tensor
     ) -> Batch:
-        """The batch of drawn pixels, their background, and random numbers from 0 to 1."""
+        """The batch of drawn pixels on a background; ``move`` and ``jitter`` are from 0 to 1."""
         far, view, row, column, colour = drawn
         origins, directions = self.views.pixel_rays(view, row.float(), column.float())
         origins, directions = self.frame.rays(origins, directions)
@@ -376,7 +376,7 @@ class RayBatches(Batches):
     def _slopes(
         self, directions: Tensor, view: Tensor, row: Tensor, column: Tensor, background: Tensor
     ) -> Batch:
-        """What `slopes` adds to a batch of drawn pixels with these directions."""
+        """The entries that `slopes` adds to a batch of pixels with these ray directions."""
         places = (row, column + 1), (row + 1, column)
         rays = (self.views.pixel_rays(view, *(x.float() for x in place))[1] for place in places)
         across = torch.stack([turned(ray, self.frame.rotation) - directions for ray in rays], dim=1)
@@ -392,17 +392,17 @@ class RayBatches(Batches):
         smooth = 0.5 - offsets.abs() / (4 * SLOPES_OVER)  # A quarter, a half and a quarter.
         kernels = torch.stack([torch.outer(smooth, step), torch.outer(step, smooth)])
         slopes = torch.einsum("rijc,kij->rck", around, kernels)
-        # Images are stored multiplied by alpha.
+        # Images are stored premultiplied by alpha.
         slopes = slopes[:, :3] - background[..., None] * slopes[:, 3:]
         return {"across": across, "slopes": slopes}
 
     def _from_memory(
         self, images: Tensor, uniform: Tensor, rays: int, errors: Tensor | None
     ) -> tuple[tuple[Tensor, ...], Batch]:
-        """Pixels drawn independently, or by their tiles' errors, from more uniform numbers.
+        """Draw pixels independently, or choose them among more candidates by their tiles' errors.
 
         Returns:
-            Whether far, view, row, column and colour [R] and [R, 4], and ``tile`` and ``weight``.
+            Whether each is far, view, row and column [R], colour [R, 4]; ``tile`` and ``weight``.
         """
         assert isinstance(self.pools, PixelPools)
         far, pixel = self.pools.pick(uniform[:, 0], uniform[:, 1])
@@ -423,7 +423,7 @@ class RayBatches(Batches):
     def _from_files(
         self, images: StoredImages, uniform: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, ...]:
-        """Whether far, view, row, column and colour of pixels drawn from a few runs."""
+        """Draw pixels from a few runs: whether each is far, its view, row, column and colour."""
         assert isinstance(self.pools, RunPools)
         number, per_run = len(uniform), _per_run(len(uniform))
         far, view, run = self.pools.pick(*uniform[::per_run, :2].T)

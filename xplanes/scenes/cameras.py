@@ -23,7 +23,7 @@ class PosedCamera:
 
     Attributes:
         camera_to_world: Its pose. [4, 4]
-        focal: Focal length in pixels, or those along x and y. [2]
+        focal: Focal length in pixels, or one each along x and y. [2]
         height: Rows.
         width: Columns.
         centre: Principal point, x from the left and y from the top; the middle when None. [2]
@@ -81,8 +81,8 @@ def cast_rays(
         lenses: One for each ray, or one for all; pinholes when None.
 
     Returns:
-        Origins and unit directions in the world, computed in double precision for distorting
-        lenses, and returned in that of ``rows``. [R, 3], [R, 3]
+        Origins and unit directions in the world. Directions through lenses are computed in double
+        precision and returned in that of ``rows``. [R, 3], [R, 3]
     """
     rotation = camera_to_world[..., :3, :3]
     if lenses is not None:
@@ -118,10 +118,10 @@ def image_plane(
     centre: Tensor | tuple[float, float],
     lenses: Lenses,
 ) -> tuple[Tensor, Tensor]:
-    """Pixel centres in focal lengths, as `Lenses.directions` takes them; arguments of `cast_rays`.
+    """Pixel centres in focal lengths, for `Lenses.directions`; arguments as for `cast_rays`.
 
     Returns:
-        To the right of the principal point, and downwards. float64 [R], [R]
+        Offsets from the principal point to the right and down. float64 [R], [R]
     """
     focal_x, focal_y = _pair(focal)
     centre_x, centre_y = _pair(centre)
@@ -196,7 +196,7 @@ def ball_extent(
 
 
 def camera_axes(camera_to_world: Tensor, points: Tensor) -> Tensor:
-    """World points along a camera's axes. [N, 3]"""
+    """World points in camera coordinates. [N, 3]"""
     return (points - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
 
 

@@ -44,7 +44,7 @@ from xplanes.settings import Location
 logger = logging.getLogger(__name__)
 
 DOUBTFUL = 1.0
-"""Mean error of COLMAP's points in pixels above which its cameras are worth refining."""
+"""Mean reprojection error in pixels above which COLMAP's cameras are worth refining."""
 
 USUAL = "images"
 """Default folder of images."""
@@ -80,7 +80,7 @@ class ColmapSettings(CaptureSettings):
             return False
         if find_model(folder, MODELS[:2]) is not None:
             return True
-        # If the model was converted to transforms.json, that is to be read.
+        # A transforms.json that was converted from the model takes precedence.
         others = any(folder.glob("transforms*.json")) or (folder / "dataset.json").is_file()
         return not others and len(models_inside(folder)) == 1
 
@@ -200,7 +200,7 @@ class ColmapSettings(CaptureSettings):
         return unit_times(found), time_source(origin, names, found)
 
     def _places(self, listing: Listing, folders: Sequence[str]) -> dict[str, list[int]]:
-        """The images of each split."""
+        """Indices of the images of each split."""
         tested: set[int] = set()
         for camera in self.test_cameras:
             inside = f"{camera.strip('/')}/"
@@ -246,7 +246,7 @@ def _model_folder(folder: Path, name: str | None) -> Path:
 
 
 def _largest(first: Path) -> Path:
-    """The numbered model with the most images among ``first`` and those beside it."""
+    """The numbered model with the most images among ``first`` and its siblings."""
     numbered = (path for path in models_inside(first.parent) if path.name.isdigit())
     if not (others := [path for path in numbered if path != first]):
         return first
@@ -262,7 +262,7 @@ def _largest(first: Path) -> Path:
 
 
 def _camera(name: str) -> str:
-    """The folder of an image, which contains those of one camera; empty if it is in none."""
+    """The folder of an image, which holds the images of one camera; empty if there is none."""
     folder = PurePosixPath(name).parent.as_posix()
     return "" if folder == "." else folder
 
@@ -270,8 +270,8 @@ def _camera(name: str) -> str:
 def _image_folder(folder: Path, name: str, model: SparseModel) -> Path:
     """The folder of the images of a model.
 
-    This is the folder of that name beside the model or above it, else the only folder of the scene
-    that contains the images, such as input.
+    This is the nearest folder ``name`` in or above the model's folder. For the default name, it may
+    also be the only folder of the scene that contains the images, such as input.
 
     Raises:
         SceneError: If there is none.

@@ -40,7 +40,7 @@ LENSES: dict[str, tuple[int, LensModel, str]] = {
 """COLMAP's camera models: their numbers in binary files, and their parameters in order."""
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "sparse_/0", "sparse_", "colmap/sparse")
-"""Usual folders of sparse models. The one in colmap/ is the source of a transforms.json."""
+"""Usual folders of sparse models. A model in colmap/ was converted to a transforms.json."""
 
 DEEPEST = 3
 """Levels of folders in which models are searched for, as in dense/0/sparse."""
@@ -70,8 +70,8 @@ class SparseModel:
         names: Image files, relative to the folder that COLMAP was run on. [V]
         camera_to_world: Poses with OpenGL's axes, in COLMAP's world. float64 [V, 4, 4]
         calibrations: Cameras and lenses. [V]
-        points: Triangulated points; None where there is no file of them. float64 [N, 3]
-        error: Their mean distance in pixels from where images show them; NaN if unknown.
+        points: Triangulated points; None if there is no file of points. float64 [N, 3]
+        error: Mean reprojection error of the points in pixels; NaN if unknown.
     """
 
     source: Path
@@ -289,7 +289,7 @@ def _cameras(path: Path) -> Iterator[tuple[str, int, Lens]]:
 
 
 def _images(path: Path) -> Iterator[tuple[str, int, str, Sequence[float]]]:
-    """Name, camera, label and world-to-camera motion of each image of a file."""
+    """Name, camera, label and world-to-camera pose of each image of a file."""
     if path.suffix == ".bin":
         with _binary(path) as file:
             for what in file.entries("image"):
@@ -305,9 +305,9 @@ def _images(path: Path) -> Iterator[tuple[str, int, str, Sequence[float]]]:
 
     count = 0
     for label, line in _text_lines(path):
-        # Every other line has three values per observed point; some programs leave it out.
+        # Every other line lists observed points, three numbers each; some programs omit it.
         words = line.split()
-        # It has only numbers, whereas an image's line has a name among its first twelve words.
+        # Such a line has only numbers; an image's line has a name among its first twelve words.
         if len(words) % 3 == 0 and all(number_in(word) is not None for word in words[:12]):
             continue
         # Names may contain spaces.
@@ -326,7 +326,7 @@ def _images(path: Path) -> Iterator[tuple[str, int, str, Sequence[float]]]:
 
 
 def _points(path: Path) -> tuple[np.ndarray, float]:
-    """The points of a file, float64 [N, 3], and their mean error in pixels; NaN if unknown."""
+    """The points of a file, float64 [N, 3], and their mean reprojection error; NaN if unknown."""
     points = []
     if path.suffix == ".bin":
         with _binary(path) as file:
@@ -360,7 +360,7 @@ def _points(path: Path) -> tuple[np.ndarray, float]:
 def _calibration(
     label: str, model: str, width: int, height: int, values: Sequence[float]
 ) -> Calibration:
-    """The lens with COLMAP's parameters."""
+    """The calibration of a camera with COLMAP's parameters."""
     if model not in LENSES:
         raise SceneError(
             f"{label} has the camera model {model}, which is not read. These are: "
@@ -405,7 +405,7 @@ def _calibration(
 
 
 def _pose(label: str, motion: Sequence[float]) -> np.ndarray:
-    """Camera-to-world matrix from a world-to-camera quaternion, real part first, and shift."""
+    """Camera-to-world matrix from world-to-camera quaternion, real part first, and translation."""
     values = np.array(motion, dtype=np.float64)
     if not np.isfinite(values).all():
         raise BrokenFrameError(f"{label}: the pose is {values.tolist()}. Export the model again.")

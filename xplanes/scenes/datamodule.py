@@ -38,15 +38,15 @@ UNIFORM = RaySettings(
 class SceneDataModule(LightningDataModule):
     """Reads a scene, checks it, and serves rays for training and views for evaluation.
 
-    A training batch is what `RayBatches.draw` or `ViewBatches.draw` returns. It depends only on the
-    seed, the rank and the number of batches before it, so a resumed run draws the same rays as an
-    uninterrupted one. The LightningModule specifies the batches by its attributes ``ray_settings``
-    (rays or whole views, which and how many) and ``frame``. Without them, a batch has 1024 rays
-    through random pixels, in the frame of the scene's cube. Batches are endless; an epoch has about
-    as many rays as the training views have pixels.
+    Training batches are drawn with `RayBatches.draw` or `ViewBatches.draw`. A batch depends only on
+    the seed, the rank, the number of batches before it and the state of the LightningModule, so a
+    resumed run draws the same rays as an uninterrupted one. The LightningModule specifies batches
+    by its attributes ``ray_settings`` (rays or whole views, which and how many) and ``frame``.
+    Without them, a batch has 1024 rays through random pixels, in the frame of the scene's cube.
+    Batches are endless; an epoch has about as many rays as the training views have pixels.
 
     `val_dataloader`, `test_dataloader` and `predict_dataloader` serve one whole view per batch, see
-    `whole_view`. Validation views are ordered so that any number of first ones is evenly spread
+    `whole_view`. Validation views are ordered so that the first n are evenly spread for every n
     (`limit_val_batches`). Several processes share the views.
 
     Args:
@@ -75,7 +75,7 @@ class SceneDataModule(LightningDataModule):
         self.first = 0
         """Number of batches already drawn."""
         self.held_out = 0
-        """Training views held out for validation, if the scene has no split for it."""
+        """Number of training views held out for validation, if the scene has no split for it."""
         self._scene: Scene | None = None
         self._batches: dict[int, Batches] = {}
 
@@ -164,7 +164,7 @@ class SceneDataModule(LightningDataModule):
     def setup(self, stage: str) -> None:
         """Read the splits that a stage needs: ``fit``, ``validate``, ``test`` or ``predict``."""
         if stage == "fit" and self.trainer is not None:
-            # After training another module, the next one begins with its own count.
+            # Each module continues its own count of batches.
             self.first = getattr(self.trainer.lightning_module, "batches", self.first)
         scores = self.trainer is None or self.trainer.limit_val_batches
         if stage in ("fit", "validate") and scores:
@@ -226,7 +226,7 @@ class SceneDataModule(LightningDataModule):
         self.held_out = len(parts["val"])
 
     def batches(self, rank: int) -> Batches:
-        """The batches of a process, for the module that is being trained, drawn on its device."""
+        """The batches of a process for the module in training, drawn on its device if possible."""
         module = None if self.trainer is None else self.trainer.lightning_module
         batches = self.batches_for(module, rank)
         device = getattr(module, "device", torch.device("cpu"))
@@ -290,7 +290,7 @@ class _Endless(IterableDataset):
         self.batches, self.data = batches, data
 
     def __len__(self) -> int:
-        # With a length Lightning does not prefetch: the number of rays is set after each step.
+        # Given a length, Lightning does not prefetch: each step sets the next number of rays.
         return max(1, self.batches.views.pixels // self.batches.rays)
 
     def __iter__(self) -> Iterator[Batch]:
@@ -355,7 +355,7 @@ def whole_view(views: Views, index: int, background: Tensor) -> dict[str, Any]:
 
 
 def spread_order(count: int) -> list[int]:
-    """An order of which any number of first elements is evenly spread over the range.
+    """An order whose first n elements are evenly spread over the range, for every n.
 
     Bit-reversed counting (van der Corput): 0, the middle, the quarters, ...
     """

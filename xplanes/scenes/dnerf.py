@@ -13,7 +13,7 @@ from xplanes.scenes.transforms import listing_of, read_frames, time_span
 from xplanes.scenes.views import Scene
 
 PARTS = ("train", "val", "test", "video")
-"""Splits, and the video of a fixed camera, whose times have one unit."""
+"""Parts that share a unit of time: splits, and the video of a fixed camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +72,7 @@ def read_scene(settings: SceneSettings, splits: Sequence[str], mask_use: MaskUse
 
 
 def _listed(split: str, path: Path, span: tuple[float, float] | None) -> Listing:
-    """The frames of a split; if one that is only scored has none, warns and leaves it out."""
+    """The frames of a split; if a scored split has none, warns before `MissingSplitError`."""
     try:
         return listing_of(path, read_frames(path), span)
     except MissingSplitError as problem:
@@ -82,7 +82,7 @@ def _listed(split: str, path: Path, span: tuple[float, float] | None) -> Listing
 
 
 def _require_times(folder: Path, parts: Mapping[str, Listing], video: Listing | None) -> None:
-    """Refuse frames of a dynamic scene without times."""
+    """Refuse splits and videos of a dynamic scene that have no times."""
     train = parts.get("train")
     if train is None or len(train.times.unique()) == 1:
         return

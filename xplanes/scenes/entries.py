@@ -54,7 +54,7 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
 
     The suffix may be missing or that of another format, and the name may differ in case or in the
     encoding of accents, as long as only one file matches. If a path does not exist, such as one of
-    another machine, its first folders are dropped; a name without folders may be in images.
+    another machine, its first folders are dropped. A name without folders is also tried in images.
 
     Args:
         label: The file and frame that name it, for messages.
@@ -170,7 +170,7 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
         folder: The scene's folder.
         name: Name relative to ``folder``, or an absolute path.
         key: The key of the name.
-        example: Such a name, for messages.
+        example: A valid name, for messages.
 
     Raises:
         SceneError: If it is not a name, or leaves the folder.
@@ -438,7 +438,7 @@ def refuse_repeats(
         other = files.setdefault(paths[index], label)
         if other is not label:
             raise SceneError(f"{label} has the same file as {other}. Remove one of the two.")
-        # In a static scene a camera may pass the same place twice; repeats are refused with times.
+        # In a static scene, a camera may pass the same place twice.
         if not times:
             continue
         other = seen.setdefault((poses[index].tobytes(), times[index]), label)

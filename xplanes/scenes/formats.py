@@ -17,7 +17,7 @@ FORMATS = """PNG JPEG MPO WEBP TIFF BMP AVIF JPEG2000 PPM TGA GIF QOI""".split()
 
 ENDINGS = """.png .jpg .jpeg .jpe .jfif .webp .tif .tiff .bmp .avif .jp2 .ppm .pgm .tga .gif
 .qoi""".split()
-"""Endings of their files."""
+"""File name endings of these formats."""
 
 RAW = ".dng .nef .cr2 .cr3 .arw .raf .orf .rw2 .pef .srw".split()
 """Endings of cameras' raw files, from which Pillow would read only a thumbnail."""
@@ -69,7 +69,7 @@ UNREADABLE = (
 
 
 def is_image(path: Path) -> bool:
-    """Whether a file's name is that of an image, in a supported format or not."""
+    """Whether a file is named like an image, in a supported format or not."""
     return path.suffix.lower() in (*ENDINGS, *OTHERS) and not path.name.startswith(".")
 
 

@@ -25,7 +25,7 @@ ROOM = 1.15
 """Margin around points: they are sparse, in particular on moving content."""
 
 LEAST_POINTS, MOST_POINTS, MOST_CAMERAS = 32, 20_000, 64
-"""Least number of points in the images' middle for a cube; sampled points and cameras."""
+"""Least number of points in the images' middle; largest numbers of sampled points and cameras."""
 
 CONVERGENCE = 0.02
 """Least eigenvalue for which optical axes meet in a point, rather than being nearly parallel."""
@@ -33,10 +33,10 @@ CONVERGENCE = 0.02
 
 @dataclass(frozen=True)
 class CubeHints:
-    """What is known of a scene's cube apart from its views.
+    """Information about a scene's cube other than its views.
 
     Attributes:
-        half_side: Half its side in world units; estimated when None.
+        half_side: Half the cube's side in world units; estimated when None.
         centre: Its centre in world coordinates; estimated when None. [3]
         points: World points on surfaces, if known. [N, 3]
     """
@@ -89,11 +89,11 @@ class Frame:
 
 @dataclass(frozen=True)
 class CameraGroups:
-    """Which training views share a pose, and where they stand.
+    """The training views grouped by pose, and the positions of the groups.
 
     Attributes:
-        index: The pose of each view. int64 [V]
-        places: Positions in the field's frame. [C, 3]
+        index: Group of each view. int64 [V]
+        places: Position of each group's camera, in the field's frame. [C, 3]
     """
 
     index: Tensor
@@ -101,7 +101,7 @@ class CameraGroups:
 
     @classmethod
     def of(cls, views: Views, frame: Frame) -> "CameraGroups":
-        """The groups of the training views: the images of a fixed camera are one."""
+        """The groups of the training views; all images of a fixed camera form one group."""
         poses, index = views.camera_to_world.unique(dim=0, return_inverse=True)
         return cls(index, frame.points(poses[:, :3, 3].float()))
 
@@ -179,7 +179,7 @@ def backwards(views: Views) -> Tensor:
 def optical_centre(views: Views) -> Tensor:
     """The point nearest to the central rays of all images, in the least-squares sense. [3]
 
-    For parallel cameras the depth is undetermined, and is that of the world's origin.
+    For parallel cameras the depth is undetermined; the depth of the world's origin is used.
     """
     origin, projector = views.camera_to_world[:, :3, 3].double(), _projectors(views)
     target = (projector @ origin[..., None])[..., 0].mean(dim=0)
@@ -204,13 +204,13 @@ def scene_frame(views: Views, hints: CubeHints = NO_HINTS) -> Frame:
 
     The cameras' common field of view gives a first cube around the point at which they look. The
     distance of the farthest foreground ray from the centre is a lower bound of the scene's radius,
-    and close to it for views from many sides: with a margin, it shrinks the cube. Views from one
-    side constrain the depth less, and shrink it less. Opaque images have no silhouettes: the cube
-    then encloses the points in the middle of most images, if enough are known.
+    and a close one for views from many sides. With a margin, it shrinks the cube; it does so less
+    for views from one side, which constrain the depth less. For opaque images, which have no
+    silhouettes, the cube encloses the points in the middle of most images, if enough are known.
 
     Args:
         views: Training views.
-        hints: What is known of the cube.
+        hints: Known parts of the cube, and surface points.
 
     Raises:
         SceneError: If the cameras see no common volume.
@@ -246,12 +246,12 @@ def scene_frame(views: Views, hints: CubeHints = NO_HINTS) -> Frame:
 
 
 def _joined(first: str, second: str) -> str:
-    """Two sources of a cube, of which the first may be empty."""
+    """Join two sources of a cube; the first may be empty."""
     return f"{first} and {second}" if first else second
 
 
 def pixels_across(views: Views, frame: Frame) -> float:
-    """Image pixels that a side of the cube covers at its centre, in the median view.
+    """Number of image pixels across the cube at its centre, in the median view.
 
     Args:
         views: Training views.
@@ -263,7 +263,7 @@ def pixels_across(views: Views, frame: Frame) -> float:
 
 
 def pixels_of_detail(views: Views, frame: Frame, surrounded: bool) -> float:
-    """`pixels_across`; 0 for moving scenes with surroundings, whose planes do not depend on it.
+    """`pixels_across`, or 0 for dynamic scenes with surroundings: planes do not depend on it.
 
     Args:
         views: Training views.
@@ -311,7 +311,7 @@ def _middle_box(views: Views, points: Tensor, centre: Tensor) -> Tensor | None:
 
 
 def _spread(views: Views) -> float:
-    """Visible share of a distance from the centre, in the best view for the worst direction.
+    """Foreshortening factor of the direction that the views show worst, in its best view.
 
     It is nearly 1 for views from all sides, small for views from one side, which foreshorten depth,
     and 0 for views along a single axis.

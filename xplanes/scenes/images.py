@@ -234,7 +234,7 @@ def shrink(channels: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def _area_weights(fine: int, coarse: int) -> np.ndarray:
-    """Overlap of each fine cell with each coarse cell of the same length. [coarse, fine]"""
+    """Weights that average fine cells into coarse cells by their overlap. [coarse, fine]"""
     edges = np.arange(coarse + 1) * (fine / coarse)
     cells = np.arange(fine)
     overlap = np.minimum(edges[1:, None], cells + 1) - np.maximum(edges[:-1, None], cells)

@@ -1,4 +1,4 @@
-"""Importance sampling of rays: more of them where images are not reproduced yet."""
+"""Importance sampling of rays: more rays where renders still differ from the images."""
 
 import math
 from collections.abc import Mapping
@@ -17,10 +17,10 @@ SIDE = 16
 """Side of a tile in pixels, doubled until there are few enough tiles."""
 
 CANDIDATES = 4
-"""Pixels from which each ray is chosen; no pixel is preferred more than this many times."""
+"""Candidate pixels per ray; also the largest factor by which a pixel is preferred."""
 
 REFRESH, KEPT = 50, 0.84
-"""Batches between updates of the errors in use, and the weight that older batches keep."""
+"""Batches between updates of the errors, and decay factor of older batches per update."""
 
 START = 300
 """Batches before pixels are preferred: errors are large everywhere at first."""
@@ -70,7 +70,7 @@ def preferred(errors: Tensor, share: float, count: int, offset: Tensor) -> tuple
 
     Returns:
         Indices of the chosen candidates, ascending, int64 [count], and the weights that make means
-        over them unbiased: the inverse of how much each was preferred. [count]
+        over them unbiased: the inverse of their relative probabilities. [count]
     """
     chance = share * errors / errors.mean() + (1 - share)
     ends = chance.clamp_max(len(errors) / count).double().cumsum(dim=0)
@@ -87,16 +87,16 @@ class ErrorMap:
         start: Batches before the errors are used, from the next update on.
 
     Attributes:
-        errors: Square root of each tile's mean squared error; that of all tiles where unknown. None
-            before they are used. [MOST_TILES]
+        errors: Root mean squared error of each tile, or of all tiles where it is unknown; None
+            before errors are used. [MOST_TILES]
     """
 
     def __init__(self, start: int = START) -> None:
         self.start, self.batches = start, 0
         self.errors: Tensor | None = None
         self._sums = torch.zeros(0)
-        """Squared errors and their number: until the last update over all processes, and since
-        then in this one; empty before the first batch. [2, 2, MOST_TILES]"""
+        """Sums of squared errors and their number: of all processes until the last update, then
+        of this process since it; empty before the first batch. [2, 2, MOST_TILES]"""
 
     def observe(self, batch: Mapping[str, Any], colour: Tensor) -> None:
         """Add the errors of a rendered batch, if it has tiles.

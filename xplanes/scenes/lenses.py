@@ -186,7 +186,7 @@ class Lenses:
             if model == LensModel.FISHEYE:
                 clear, aside = away > radius, local[points, :2].double().norm(dim=-1)
                 angle, half = torch.atan2(aside, front), (radius / away).clamp(max=1).asin()
-                # Along a circle around the axis, then a radius; or through the image centre.
+                # Length of a path along a circle and a radius, or of one through the image centre.
                 turn = torch.where(aside > radius, (radius / aside).asin(), math.inf)
                 through = angle + (angle + half).clamp(max=math.pi)
                 bound = torch.minimum(half + angle * turn, through)
@@ -262,7 +262,7 @@ def sight(lens: Lenses, focal: Tensor, centre: Tensor, height: int, width: int) 
 
 
 def _stretch(lens: Lenses, border: Tensor) -> float:
-    """Largest derivative of the distortion in the circle around an image's border. [B, 3]"""
+    """Upper bound of the distortion's derivative within an image's border rays. [B, 3]"""
     omega = float(lens.coefficients[0, 0])
     if lens.model[0] == LensModel.FOV:
         return 2 * math.tan(omega / 2) / omega if omega else 1.0
@@ -289,7 +289,7 @@ def _terms(lenses: Lenses) -> list[Tensor]:
 
 
 def _ratio(square: Tensor, terms: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """Radial distortion at squared radii, and its derivative by the square."""
+    """Radial distortion factor at squared radii, and its derivative with respect to them."""
     a1, a2, a3, a4, b1, b2, b3 = terms[:7]
     top = 1 + square * (a1 + square * (a2 + square * (a3 + square * a4)))
     top_slope = a1 + square * (2 * a2 + square * (3 * a3 + square * 4 * a4))
@@ -309,7 +309,7 @@ def _radial(radius: Tensor, terms: list[Tensor]) -> tuple[Tensor, Tensor]:
 def _distort(
     x: Tensor, y: Tensor, terms: list[Tensor]
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """Distorted points and the derivatives of x by x and y, and of y by x and y."""
+    """Distorted points and their Jacobian: x by x, x by y, y by x and y by y."""
     p1, p2, s1, s2, s3, s4 = terms[7:]
     square, product = x * x + y * y, 2 * x * y
     ratio, slope = _ratio(square, terms)
@@ -331,7 +331,7 @@ def _determinant(slopes: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
 
 
 def _undo(x: Tensor, y: Tensor, lenses: Lenses) -> tuple[Tensor, Tensor, Tensor]:
-    """Undistorted points of x and y, and whether they exist. [R] each"""
+    """Undistorted x and y of points, and whether they exist. [R] each"""
     terms, limit = _terms(lenses), lenses.limit
     target = torch.hypot(x, y)
     most = limit * _radial(limit, terms)[0]
@@ -340,8 +340,8 @@ def _undo(x: Tensor, y: Tensor, lenses: Lenses) -> tuple[Tensor, Tensor, Tensor]
     scale = torch.where(target > 0, radius / target, 1.0)
     if not any(term.any() for term in terms[7:]):
         return scale * x, scale * y, found
-    # Initial value from the radial term, as the others are small. It lies within the limit, at
-    # which the derivative is 0.
+    # Start from the radial term, as the others are small, but inside the limit, where the
+    # derivative is 0.
     scale = torch.where(found, scale, 0.98 * scale)
     right, down = scale * x, scale * y
     for _ in range(50):

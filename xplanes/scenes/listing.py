@@ -1,4 +1,4 @@
-"""Lists of images with poses and times, which all readers return, and conversion to views."""
+"""Lists of images with poses and times, and their conversion to views."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -201,7 +201,7 @@ def held_out_places(times: Sequence[float], every: int) -> list[int]:
     """Evenly spaced indices of views to hold out, one per group of ``every`` views in time.
 
     If several cameras observe each timestep, a fixed index within the groups could always select
-    the same camera; the index then varies from group to group.
+    the same camera, so the index varies from group to group.
 
     Args:
         times: Times of the views, in ascending order.
@@ -262,8 +262,8 @@ def read_views(
 ) -> Views:
     """Read the images of a listing, with their masks, and reduce them to a width.
 
-    Pixels to which a fisheye or FOV lens maps no direction, such as those outside the image circle,
-    get alpha 0 and no rays.
+    Pixels to which a lens maps no direction, such as those outside a fisheye's image circle, get
+    alpha 0 and no rays.
 
     Args:
         listing: At least one image.
@@ -275,8 +275,8 @@ def read_views(
 
     Raises:
         MissingSplitError: If all pixels of all images are masked out.
-        SceneError: If a file cannot be decoded, the resolution cannot be met, or a perspective
-            lens maps no direction to a pixel.
+        SceneError: If a file cannot be decoded, the resolution cannot be met, or `require_rays`
+            refuses a lens.
     """
     if kind is None:
         kind = survey(listing.masks) if any(listing.masks) else GREY
@@ -321,7 +321,7 @@ def _without_ignored(listing: Listing, rest: Sequence[int]) -> Listing:
         f"masks leave out all pixels of {len(gone)} of {len(listing)} images: {some(gone)} in "
         f"{listing.paths[0].parent}"
     )
-    # Without a split other images are scored, so that this is said even if the split is missing.
+    # Also warn if the whole split is left out, because other images are then scored.
     warn(f"{text}. These are left out; set data.mask_use=alpha if they show empty space.")
     if not rest:
         raise MissingSplitError(
@@ -494,9 +494,9 @@ def _require_real(
 def require_rays(
     labels: Sequence[str], lenses: Sequence[Calibration], has_ray: Sequence[Tensor | None]
 ) -> None:
-    """Refuse images whose lens maps no direction to most of their pixels.
+    """Refuse images where most pixels of a perspective lens, or all pixels of another, lack rays.
 
-    If there are only a few such pixels, a perspective lens gets a warning, and they are left out.
+    Fewer such pixels of a perspective lens are left out, with a warning.
 
     Args:
         labels: The images, for messages. [V]

@@ -215,7 +215,7 @@ def ignored_pixels(
     sizes: Sequence[tuple[int, int]],
     kind: MaskKind,
 ) -> Tensor:
-    """Pixels of reduced images that are at least partly masked out, padded. bool [V, H, W]
+    """Pixels of reduced images whose mask coverage is below `KEPT`, padded. bool [V, H, W]
 
     Args:
         masks: A file for each image, or None. [V]

@@ -235,7 +235,7 @@ def recordings_of_cameras(folder: Path) -> list[Path]:
     numbered = [path for path in inside if NUMBERED.fullmatch(path.stem)]
     numbered.sort(key=lambda path: natural(path.name))
     named = [path for path in inside if path.name.lower().startswith("cam")]
-    # Without others, such as camera_paths.
+    # Names with digits take precedence over others, such as camera_paths.
     return [path for path in named if re.search(r"\d", path.name)] or named or numbered
 
 
@@ -445,7 +445,7 @@ def _distances(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def _video_camera(cameras: Sequence[Camera], parts: dict[str, list[int]], name: str | None) -> int:
-    """Index of the camera whose video the LRM is given."""
+    """Index of the camera whose video is the input of the LRM."""
     train = parts["train"]
     if name is None:
         away = _distances(cameras)
@@ -528,7 +528,7 @@ def _are_stamped(recordings: Sequence[Recording]) -> bool:
 
 
 def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
-    """The recordings without images of timesteps that some camera lacks; warns about these.
+    """The recordings, without images of timesteps that some cameras lack; warns about these images.
 
     Images of equal numbers are simultaneous. If the cameras' numbers do not overlap, they are
     counted from the first of each camera.
@@ -574,7 +574,7 @@ def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
 def _frame_numbers(
     folder: Path, recordings: Sequence[Recording], frames: Sequence[int] | None, stamped: bool
 ) -> list[range]:
-    """Frames to read of each camera: the same numbers, unless they have their own times."""
+    """Numbers of each camera's frames to read: equal ones, unless time stamps are used."""
     shortest = min(recordings, key=lambda recording: recording.count)
     longest = max(recordings, key=lambda recording: recording.count)
     if frames is not None:

@@ -89,9 +89,9 @@ def _clock(stem: str) -> float | None:
 
 
 def _most_different(texts: Sequence[str]) -> list[Number]:
-    """The number in each name at the position where numbers vary most, the last one of equals.
+    """The number in each name at the position where numbers vary most, or the last such position.
 
-    None for a name without a number.
+    If names have different counts of numbers, their last ones; empty if a name has none.
     """
     rows = [re.findall(NUMBER, text) for text in texts]
     if not all(rows):

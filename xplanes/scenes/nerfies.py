@@ -79,7 +79,7 @@ class NerfiesSettings(CaptureSettings):
     def _listing(
         self, names: Sequence[str], pictures: str
     ) -> tuple[Listing, Sequence[str], np.ndarray | None]:
-        """Images in a folder of rgb, the names of usable ones, and points."""
+        """The usable images in a subfolder of rgb, their names, and the points."""
         folder = self.folder
         root = folder.resolve()
         scale, centre = _scene(folder / "scene.json")
@@ -146,7 +146,7 @@ class NerfiesSettings(CaptureSettings):
 
 
 def _splits(folder: Path, protocol: str | None) -> tuple[dict[str, list[str]], Path]:
-    """Names of the training images and of those to score, and the file that lists them.
+    """Names of the training and validation images, and the file that lists them.
 
     If no images are listed for scoring, all images are training images.
     """
@@ -281,8 +281,8 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
 def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) -> str:
     """The folder in rgb of the smallest images that are at least as wide as requested.
 
-    Without such images, or without a width, the largest ones. If images of that scale are missing,
-    warns and uses the scale with the fewest missing images, preferring the next larger one.
+    If there are none, or no width is requested, that of the largest images. If it lacks images,
+    warns and uses the folder that lacks the fewest, preferring the next larger scale.
     """
     widths: dict[str, int] = {}
     lost: dict[str, list[str]] = {}

@@ -70,7 +70,7 @@ def _listed_splits(
             try:
                 image = image_path(str(path), path.parent.resolve(), name, key)
             except BrokenFrameError as problem:
-                if PurePosixPath(name) not in files:  # Others were told of as frames.
+                if PurePosixPath(name) not in files:  # Missing frames are reported already.
                     missing.append(f"{key}: {problem}")
                 continue
             if image not in places:

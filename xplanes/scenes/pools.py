@@ -41,8 +41,8 @@ class PixelPools:
         valid: Pixels that may be drawn; None for all. bool [V, H, W]
 
     Attributes:
-        sizes: Numbers of far, textureless and other pixels; if there were no others, none are
-            textureless.
+        sizes: Numbers of far, textureless and other pixels; if all near pixels are textureless,
+            they count as others.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class PixelPools:
         return moved
 
     def pick(self, kind: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
-        """Whether far, and index of pixels drawn by uniform numbers. [R] -> bool [R], int64 [R]"""
+        """Draw pixels by uniform numbers: whether each is far, its index. [R] -> bool, int64 [R]"""
         kind = torch.bucketize(kind.contiguous(), self.bounds, right=True)
         place = torch.addcmul(self.starts[kind], where, self.counts[kind]).long()
         place.clamp_(max=self.total - 1)
@@ -118,7 +118,7 @@ class RunPools:
     Args:
         views: Views whose images are ``images``.
         images: Images in files of pixels.
-        margins: Pixels around the silhouette of each image that are near, too. [V]
+        margins: Margin in pixels around each image's silhouette that is near, too. [V]
 
     Attributes:
         sizes: Numbers of far, textureless and near pixels; none are textureless.
@@ -161,7 +161,7 @@ class RunPools:
         self.far_share = far
 
     def pick(self, kind: Tensor, where: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Runs drawn by uniform numbers: whether far, view, and index within the view. [K] each"""
+        """Draw runs by uniform numbers: whether each is far, its view, its index there. [K] each"""
         far, total, (size, _, rest) = kind < self.far_share, int(self.first[-1]), self.sizes
         place = torch.where(far, where * size, size + where * rest).long()
         place = place.clamp_(max=size + rest - 1)

@@ -11,7 +11,7 @@ from xplanes.scenes.cameras import ball_extent, project
 from xplanes.scenes.views import Views
 
 WINDOW = 0.06
-"""Window, as a share of the time span, in which silhouettes are intersected as if static."""
+"""Window in time, as a share of the views, in which silhouettes are intersected as if static."""
 
 SAME_COLOUR = 4
 """Largest difference, out of 255, between pixels of one colour."""
@@ -23,7 +23,7 @@ CHANGE = 20
 """Least difference from the median, out of 255 in any channel, of a changed pixel."""
 
 MOST_VIEWS = 5
-"""Most views in the window: more would remove moving content and empty little else."""
+"""Most views in the window: more would cut off moving content and carve away little else."""
 
 
 def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
@@ -158,7 +158,7 @@ def changing(views: Views, margins: Sequence[int]) -> Tensor | None:
 
     Args:
         views: Opaque images in memory.
-        margins: Margin around those that differ in pixels, for each image. [V]
+        margins: Margin around changed pixels, in pixels, for each image. [V]
 
     Returns:
         bool [V, H, W]; None if a camera moves or has few images, or nothing changes.

@@ -3,7 +3,7 @@
 A file contains the pixels of all images in order, row by row. For images with alpha, one bit per
 pixel follows at the end: whether the pixel belongs to the silhouette. The file's name is a hash of
 the sources and of the decoding, so that it needs no header: a file with that name and the right
-length is valid. Its modification time is that of its last use.
+length is valid. Its modification time is the time of its last use.
 
 Pixels are read rather than memory-mapped: pages of a mapping count as memory of the process, and
 truncating a mapped file kills the process.
@@ -444,7 +444,7 @@ def _parts(
 
 
 def _bits(first: Sequence[int], index: int) -> int:
-    """Offset of the bits of image ``index``; an extra byte per image allows for incomplete ones."""
+    """Offset of the bits of image ``index``; an extra byte per image allows for a partial byte."""
     return first[-1] * 4 + first[index] // 8 + index
 
 

@@ -38,7 +38,7 @@ OTHER_MODELS = (
     *("FISHEYE", "EQUIRECTANGULAR", "ORTHO", "OMNI", "VR180", "DIVISION", "EUCM"),
     *("SPHERICAL", "CYLINDRICAL", "PANORAM", "360"),
 )
-"""Parts of names of unsupported lens models; those above take precedence."""
+"""Parts of names of unsupported lens models; `FISHEYES` take precedence."""
 
 PERSPECTIVES = (
     *("PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"),
@@ -172,7 +172,7 @@ class _Frame(NamedTuple):
 
 
 def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame]:
-    """Usable frames; warns about those without an image, a finite pose, or a time if most have."""
+    """Usable frames; warns about those without image, finite pose, or time if most have one."""
     entries = content["frames"]
     key = _key(entries)
     timed = sum(entry.get(key) is not None for entry in entries)
@@ -283,7 +283,7 @@ def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> C
     down = focal_length(angle, height)
     if abs(down / across - 1) < SQUARE:
         return camera
-    # In the pixel size to which principal points refer.
+    # In pixels of the image size to which principal points refer.
     wide = camera.w or width * (camera.h or height) / height
     high = camera.h or height * wide / width
     sides = {"fl_x": across * wide / width, "fl_y": down * high / height, "w": wide, "h": high}

@@ -326,7 +326,7 @@ class Views:
         return silhouette_of(self.image(index)[..., 3])
 
     def valid(self) -> Tensor:
-        """Pixels with a ray that are not padding. bool [V, H, W]"""
+        """Pixels that are not padding, have a ray and are not ignored. bool [V, H, W]"""
         height, width = self.intrinsics.size.unbind(dim=1)
         rows = torch.arange(self.height) < height[:, None]
         columns = torch.arange(self.width) < width[:, None]
@@ -377,7 +377,7 @@ class Views:
         return image[..., :3] + (1 - image[..., 3:]) * background
 
     def edge_share_of(self, index: int, colour: Tensor) -> float:
-        """Share of the pixels at the edge of image ``index`` that have about a colour. [3]"""
+        """Share of the pixels at the edge of image ``index`` that are close to a colour [3]."""
         image, has_ray = self.image(index), self.shown(index)
         pale = (image[..., :3].short() - (255 * colour).short()).abs().amax(dim=-1) < PALE_STEPS
         edge = torch.ones_like(pale) if has_ray is None else has_ray.clone()
@@ -468,7 +468,7 @@ def joined(first: Views, second: Views) -> Views:
 
 
 def _stored(views: Views) -> StoredImages:
-    """The images in the form of images in a file."""
+    """The images as `StoredImages`; tensors are copied to a `PixelFile` in memory."""
     if isinstance(views.images, StoredImages):
         return views.images
     return StoredImages.all_of(PixelFile.of(views.image(index) for index in range(len(views))))
@@ -484,7 +484,7 @@ class Scene:
         video: Frames of a fixed camera; None if there are none.
         background: Background colour in scores and rendered images, from 0 to 1. [3]
         static_reason: Why the scene is known to be static; empty if it may be dynamic.
-        points: Surface points in the world, such as from structure from motion; None if unknown.
+        points: Surface points in the world, for example from COLMAP; None if unknown.
             float32 [N, 3]
         lrm_views: Training views masked to the foreground object, for LRMs alone; None if there are
             no masks, or the alpha of ``splits`` contains them.

@@ -27,7 +27,7 @@ from xplanes.tools.export_web import Shape, write_page
 from xplanes.tools.runs import TrainedRun
 
 KINDS = ("mesh", "points", "planes", "path", "web")
-"""Values of ``--what`` without those that a field adds with its `exports`."""
+"""Values of ``--what`` for any field; a field can add others with its `exports`."""
 FORMATS = ("ply", "glb")
 
 TIMES, WEB_TIMES = 10, 24
@@ -61,7 +61,7 @@ Z_UP_TO_Y_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What to export.
+    """Options of `xplanes export`.
 
     Attributes:
         what: ``mesh``, ``points``, ``planes``, ``path``, ``web``, or a name in the field's
@@ -69,8 +69,8 @@ class ExportOptions:
         times: A number of times spread evenly from 0 to 1, or times separated by commas; None for
             10 times, 24 for a web page, or 1 for a static scene.
         resolution: Grid points along each side of the field's cube.
-        threshold: Density of the surface, per unit length of the field's frame; None for the one
-            that `find_threshold` returns.
+        threshold: Density of the surface, per unit length of the field's frame; None for the
+            result of `find_threshold`.
         count: Points of a point cloud; None for 100,000, or for a mesh in a web page.
         form: File format of meshes and point clouds: ``ply`` or ``glb``.
     """
@@ -86,7 +86,7 @@ class ExportOptions:
         """Check the options without a run.
 
         Raises:
-            ConfigError: With the option, its value and what is allowed.
+            ConfigError: If an option is invalid; the message says what is allowed.
             MissingExtraError: For meshes and points without the extra ``export``.
         """
         if self.form not in FORMATS:
@@ -151,7 +151,7 @@ def export(
 
     Args:
         trained: The run.
-        options: What to export.
+        options: Content and format of the export.
         out: Folder to write into, empty or new; ``export/WHAT`` in the run directory when None.
         say: Receives progress messages.
 
@@ -346,8 +346,8 @@ def _write_web(
 def _glb(geometry: Any) -> bytes:
     """A GLB file with y up and a matt material.
 
-    GLB's y axis points up, the world's z axis does. The default material is metallic, and black
-    where nothing is reflected.
+    In GLB files the y axis points up, in the world the z axis. The default material is metallic,
+    and black where nothing is reflected.
     """
     _, trimesh = _mesh_tools()
     scene = trimesh.Scene()
@@ -415,8 +415,8 @@ def solidity(trained: TrainedRun, time: float, resolution: int) -> tuple[Tensor,
     """Sample the field at the centres of a grid's cells, as opacity or as depth below its surface.
 
     Opacity of one cell is used instead of density: density varies widely inside solid objects, so
-    it interpolates badly. For a field of signed distances it is the depth below the surface, at
-    most a cell on either side. Points in empty cells of the occupancy grid are not evaluated.
+    it interpolates badly. A field of signed distances gives the depth below the surface, clamped
+    to a cell on either side. Points in empty cells of the occupancy grid are not evaluated.
 
     Args:
         trained: The run.
@@ -523,7 +523,7 @@ def _peaks(volume: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
 
 @torch.no_grad()
 def surface_colours(trained: TrainedRun, points: Tensor, normals: Tensor, time: float) -> Tensor:
-    """Colours of points on or below a surface, seen along the inverse normals.
+    """Colours of points on or below a surface, viewed against their normals.
 
     Args:
         trained: The run.

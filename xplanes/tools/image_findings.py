@@ -163,7 +163,7 @@ def texel_findings(
         native: Width of these images.
         wide: Width of the images in training.
         resolution: Texels along an axis of the planes.
-        fine: Whether the model can have finer planes beside them (``model.fine``).
+        fine: Whether the model can have additional finer planes (``model.fine``).
     """
     per_texel *= wide / native
     if per_texel > COARSE:

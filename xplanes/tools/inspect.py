@@ -425,7 +425,7 @@ def _split_rows(each: Mapping[str, Any]) -> dict[str, str]:
 def next_command(capture: Capture) -> str:
     """The command that trains on the capture, at the format's default width if images are wider.
 
-    Without an LRM where images show surroundings: LRMs reconstruct single objects.
+    It uses no LRM if images show surroundings, because LRMs reconstruct single objects.
     """
     overrides = [*capture.choice.overrides]
     if capture.scene.is_surrounded and not any(text.startswith("lrm=") for text in overrides):

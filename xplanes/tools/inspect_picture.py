@@ -324,7 +324,7 @@ def _sample(views: Views, index: int, size: tuple[int, int], frame: Frame | None
     height, width = views.size(index)
     wide, high = SCALE * size[0], SCALE * size[1]
     pixels = views.image(index).numpy()
-    # The colours are already multiplied by alpha; Pillow would multiply those of RGBA again.
+    # Colours are premultiplied by alpha; Pillow would multiply an RGBA image again.
     parts = [Image.fromarray(part.copy()) for part in (pixels[..., :3], pixels[..., 3])]
     smooth = Image.Resampling.BOX if width > wide else Image.Resampling.NEAREST
     colour, alpha = (

@@ -18,7 +18,7 @@ from xplanes.training.module import RadianceModule
 logger = logging.getLogger(__name__)
 
 PATIENCE = 1.0
-"""Longest time in seconds that training waits for a picture, or the last step's if longer."""
+"""Longest wait of training for a picture, in seconds, unless the last step took longer."""
 
 TOLD_SECONDS = 0.5
 """Seconds between two updates of the status line."""

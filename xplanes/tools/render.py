@@ -42,7 +42,7 @@ LARGEST = 8192
 
 @dataclass(frozen=True)
 class VideoOptions:
-    """What to render.
+    """Options of `xplanes render`.
 
     Attributes:
         path: Camera: ``orbit``, ``fixed`` (the first camera of the orbit), ``view:FILE``, or a
@@ -134,7 +134,7 @@ class VideoOptions:
         """Check the options without a run.
 
         Raises:
-            ConfigError: With the option, its value and what is allowed.
+            ConfigError: If an option is invalid; the message says what is allowed.
             SceneError: If a camera path cannot be used.
         """
         views = self.path.startswith("view:")
@@ -168,7 +168,7 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
 
     Args:
         trained: The run.
-        options: What to render.
+        options: Cameras, times and size of the frames.
         out: A file (.webp, .mp4, .png, .jpg), or a folder if it ends in /; None for a file in the
             run's media/ that is named after the options.
 
@@ -264,10 +264,10 @@ def pixels_with_rays(options: VideoOptions, splits: dict[str, Views]) -> Tensor 
 
 
 def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:
-    """Find the view with a file name, with or without extension: the views of its split, its index.
+    """Find a view by file name, with or without extension; returns its split and its index there.
 
     Raises:
-        ConfigError: If there is no such view, with similar names.
+        ConfigError: If there is no such view; the message lists similar names.
     """
     known = {file: (v, index) for v in splits.values() for index, file in enumerate(v.files)}
     for file, found in known.items():

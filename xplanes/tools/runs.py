@@ -21,7 +21,7 @@ from xplanes.training.record import read_config, require_same_views
 
 OUTPUTS = Path("outputs")
 LISTED = 5
-"""Runs that an error message lists."""
+"""Most runs that an error message lists."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def find_run(path: Path, outputs: Path = OUTPUTS) -> Path:
     """Check that ``path`` is a run directory.
 
     Raises:
-        ConfigError: If it is not one, with runs of similar names or the newest runs.
+        ConfigError: If it is not one; the message lists runs of similar names, or the newest.
     """
     if is_run(path):
         return path

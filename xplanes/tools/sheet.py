@@ -50,7 +50,7 @@ def write_sheet(
 ) -> Path:
     """Write a contact sheet of all runs in a folder.
 
-    With "runs", only the first of runs that differ in their seed alone is shown, unless all do.
+    With "runs", one seed per setting is shown, unless all runs differ only in their seed.
 
     Args:
         folder: A run, a sweep, or any folder of runs.
@@ -64,7 +64,7 @@ def write_sheet(
         size: Pixels of a tile's longer side.
 
     Raises:
-        ConfigError: If there are no runs or pictures, no such view or step, or several such views.
+        ConfigError: If there are no runs, pictures, such view or step, or ``view`` is ambiguous.
     """
     check_what(what)
     out = out or folder / f"sheet_{what}.png"

@@ -147,7 +147,6 @@ class SweepTable(Callback):
         reason = f"{type(value).__name__}: {value}"
         say(f"job {config.hydra.job.num} failed: {reason}  {run.name}")
         if not (run / "run.json").exists():
-            # The job failed before it wrote run.json.
             write_json(run / "run.json", {"status": "failed", "reason": reason})
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:

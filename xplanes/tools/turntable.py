@@ -89,7 +89,7 @@ def write_triplanes(
 
 
 def find_pictures(paths: Sequence[Path]) -> list[Path]:
-    """Image files; of a folder all images, in natural order of their names.
+    """Image files; for a folder, all its images in natural order of their names.
 
     Raises:
         SceneError: If a path is missing, or there are no images.

@@ -365,7 +365,7 @@ class _Browser:
         return max(FEWEST, min(full, int(math.sqrt(pixels))))
 
     def draw(self, height: int, now: float) -> None:
-        """Render and send a picture; one at rest is abandoned on a change."""
+        """Render and send a picture; unless it shows a change itself, a new change abandons it."""
         viewer, version = self.viewer, self.version
         resting = version == self.drawn
         field, shot = viewer.module.field, viewer.shot(self.client.camera, height)

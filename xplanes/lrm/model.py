@@ -53,8 +53,8 @@ class LRM(nn.Module):
         """Predict triplanes from images.
 
         Args:
-            images: RGB from 0 to 1, composited on the grey ``view.background``. OpenLRM requires S to be a multiple
-                of its patch size. [N, 3, S, S]
+            images: RGB from 0 to 1, composited on the grey ``view.background``. OpenLRM requires S
+                to be a multiple of its patch size. [N, 3, S, S]
             camera: Camera vectors of OpenLRM; the canonical camera when None. TripoSR has no camera
                 input. [N, 16]
 

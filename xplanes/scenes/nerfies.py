@@ -11,7 +11,6 @@ import numpy as np
 
 from xplanes.errors import BrokenFrameError, SceneError, warn
 from xplanes.scenes.entries import (
-    SUFFIXES,
     checked_pose,
     image_path,
     is_number,
@@ -24,6 +23,7 @@ from xplanes.scenes.entries import (
     unit_times,
     usable,
 )
+from xplanes.scenes.formats import ENDINGS
 from xplanes.scenes.images import native_sizes
 from xplanes.scenes.listing import Calibration, Listing, held_out, time_source
 from xplanes.scenes.source import CaptureSettings
@@ -65,7 +65,7 @@ class NerfiesSettings(CaptureSettings):
         chosen, source = _splits(folder, self.protocol)
         names = list(dict.fromkeys(name for part in chosen.values() for name in part))
         pictures = _picture_folder(folder, names, self.resolution)
-        lost = {*_missing(folder / "rgb" / pictures, names, SUFFIXES[1:])}
+        lost = {*_missing(folder / "rgb" / pictures, names)}
         names = [name for name in names if name not in lost]
         listing, names, points = self._listing(names, pictures)
         chosen = {split: [n for n in part if n in {*names}] for split, part in chosen.items()}
@@ -289,10 +289,10 @@ def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) 
     for path in (folder / "rgb").glob("*x"):
         if not path.name[:-1].isdecimal():
             continue
-        missing = _missing(path, names, SUFFIXES[1:])
+        missing = _missing(path, names)
         there = next((name for name in names if name not in set(missing)), None)
         if there is not None:
-            files = [path / f"{there}{end}" for end in SUFFIXES[1:]]
+            files = [path / f"{there}{end}" for end in ENDINGS]
             widths[path.name] = native_sizes([next(filter(Path.is_file, files))])[0][1]
             lost[path.name] = missing
     if not widths:
@@ -317,9 +317,11 @@ def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) 
     return chosen
 
 
-def _missing(folder: Path, names: Sequence[str], ends: Sequence[str]) -> list[str]:
+def _missing(folder: Path, names: Sequence[str]) -> list[str]:
     """Names without a file in a folder."""
-    return [name for name in names if not any((folder / f"{name}{end}").is_file() for end in ends)]
+    return [
+        name for name in names if not any((folder / f"{name}{end}").is_file() for end in ENDINGS)
+    ]
 
 
 def _points(path: Path) -> np.ndarray | None:

@@ -164,12 +164,7 @@ def _tangents(
 
 
 def _poses(entries: Entries, key: str) -> Tensor:
-    poses = []
-    for label, entry in entries.items():
-        matrix = entry.get(key)
-        if isinstance(matrix, list) and len(matrix) == 16:
-            matrix = [matrix[start : start + 4] for start in range(0, 16, 4)]
-        poses.append(checked_pose(label, matrix, key))
+    poses = [checked_pose(label, entry.get(key), key) for label, entry in entries.items()]
     return torch.from_numpy(np.stack(poses)).float()
 
 

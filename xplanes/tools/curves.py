@@ -56,7 +56,8 @@ def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> boo
         panel.grid(alpha=0.3)
     place: Any = {"loc": "outside lower center", "ncols": across, "fontsize": "small"}
     figure.legend(handles.values(), labels, **place)
-    return _save(figure, path)
+    _save(figure, path)
+    return True
 
 
 def plot_against(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
@@ -92,13 +93,13 @@ def plot_against(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bo
     panel.set(xlabel=name, ylabel="PSNR, dB", xticks=range(len(ticks)), xticklabels=words)
     panel.grid(alpha=0.3)
     panel.legend(fontsize="small")
-    return _save(figure, path)
+    _save(figure, path)
+    return True
 
 
-def _save(figure: Any, path: Path) -> bool:
+def _save(figure: Any, path: Path) -> None:
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
-    return True
 
 
 def run_label(row: RunRow, names: Sequence[str]) -> str:

@@ -118,7 +118,7 @@ def _means(runs: Sequence[RunRow]) -> list[str]:
 
 def _published(entry: Entry) -> list[str]:
     if not entry:
-        return [""] * 5
+        return [""] * len(PUBLISHED)
     numbers = [entry[name] for name in ("psnr", "ssim", "minutes", "scenes")]
     return [*numbers, f"{entry['table']}, {entry['source']}"]
 

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -195,10 +194,16 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
 def _frames(module: RadianceModule, scene: Scene, options: VideoOptions) -> Iterator[Tensor]:
     frame, splits = module.frame, scene.splits
     assert frame is not None
-    path = cameras(options, splits, frame), options.times
-    shown = pixels_with_rays(options, splits)
-    how: Any = {"background": scene.background, "what": options.what, "shown": shown}
-    return render_path(module.field, module.renderer, frame, *path, **how)
+    return render_path(
+        module.field,
+        module.renderer,
+        frame,
+        cameras(options, splits, frame),
+        options.times,
+        background=scene.background,
+        what=options.what,
+        shown=pixels_with_rays(options, splits),
+    )
 
 
 def check_out(out: str | None, options: VideoOptions) -> None:

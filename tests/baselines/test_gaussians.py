@@ -464,3 +464,12 @@ def test_what_does_not_fit_is_refused(tmp_path, scenes):
     lens = Lenses.pinholes(1)
     with pytest.raises(SceneError, match="undistort the images"):
         camera_in(FRAME, replace(camera, lens=lens))
+
+
+def test_scales_stay_finite_however_far_they_grow():
+    field = gaussians(5)
+    with torch.no_grad():
+        field.log_scales[:] = 300.0
+    for scales in (field.at(0.5).scales, field.scales):
+        assert (scales > 100).all()
+        assert scales.isfinite().all()

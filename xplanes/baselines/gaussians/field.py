@@ -31,6 +31,9 @@ ROWS = 1024
 TIME_FEATURES = 30
 """Number of time features (Yang et al. 2024)."""
 
+LARGEST = 7.0
+"""Largest logarithm of a standard deviation: 500 cubes. In scenes with surroundings some grow."""
+
 HEADS = {"shift": 3, "turn": 4, "growth": 3}
 """Columns of the offsets of means, quaternions and scales."""
 
@@ -160,7 +163,7 @@ class Gaussians(Representation):
     @property
     def scales(self) -> Tensor:
         """Canonical standard deviations. [N, 3]"""
-        return self.log_scales.exp()
+        return self.log_scales.clamp_max(LARGEST).exp()
 
     @property
     def opacities(self) -> Tensor:
@@ -272,7 +275,7 @@ class HexPlaneGaussians(Gaussians):
             canonical,
             means=canonical.means + shift,
             quaternions=canonical.quaternions + turn,
-            scales=(self.log_scales + growth).exp(),
+            scales=(self.log_scales + growth).clamp_max(LARGEST).exp(),
         )
 
 

@@ -67,7 +67,7 @@ def _found(package: str, consequence: str) -> bool:
         with warm_up.timed():
             importlib.import_module(package)
     except Exception as error:
-        # An installed package can fail to import next to an incompatible version of another.
+        # The import can fail if another package has an incompatible version.
         reason = str(error).strip().split("\n")[0]
         logger.warning("%s cannot be imported (%s): %s", package, reason, consequence)
         return False
@@ -122,9 +122,9 @@ def _settle_triton() -> None:
 
 
 def gpu_kernels(tensor: Tensor) -> bool:
-    """Whether Triton kernels apply to ``tensor``: on CUDA, where results are not bit-identical.
+    """Whether Triton kernels apply to ``tensor``: on CUDA, unless the run must be deterministic.
 
-    The order in which threads add to a gradient varies, so deterministic runs do not use them.
+    Threads add to a gradient in varying order, so results are not bit-identical.
     """
     return (
         tensor.device.type == "cuda"
@@ -159,10 +159,10 @@ def proven(
     Args:
         what: Name of the operation, for the message.
         device: Device of the trial.
-        attempt: Runs a function on a small input of a given type; returns values and gradients.
+        attempt: Calls a function on a small input of a dtype; returns values and gradients.
         kernels: The kernels on trial.
         reference: The reference implementation.
-        dtype: Type of the planes; the reference computes in float32 at least.
+        dtype: Dtype of the planes; the reference computes in float32 or higher.
 
     Raises:
         DeviceError: If the device no longer responds.
@@ -177,7 +177,7 @@ def proven(
                     ours.to(exact), theirs, atol=tolerance, rtol=tolerance, check_dtype=False
                 )
     except Exception as error:
-        # A compiler's failure must not end the run: PyTorch computes the same.
+        # The run continues with the PyTorch implementation.
         reason = str(error).strip().split("\n")[0] or "no reason given"
         reason = f"{type(error).__name__}: {reason}"
         _require_alive(device, what, reason)
@@ -217,7 +217,7 @@ def fast_bf16(device: torch.device) -> bool:
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit` with its cache on disk, where numba finds a folder that it can write to.
+    """`numba.njit` with an on-disk cache if numba finds a writable folder.
 
     Args:
         options: As for `numba.njit`; ``cache`` is set here.
@@ -244,13 +244,13 @@ def _warn_not_cached() -> None:
 
 
 def compiled(module: str) -> Any:
-    """A module of compiled loops. Loading the first takes a second; compiling, once, a few more."""
+    """Import numba loops, which compile on first use; the first import takes about a second."""
     _start_threads()
     return importlib.import_module(module)
 
 
 def gpu_module(module: str) -> Any:
-    """A module of Triton kernels, which need no numba."""
+    """Import a module of Triton kernels; does not load numba."""
     return importlib.import_module(module)
 
 
@@ -262,10 +262,10 @@ def synchronize(device: torch.device) -> None:
 
 @functools.cache
 def _start_threads() -> None:
-    """Start as many threads for the loops as PyTorch uses, without changing PyTorch's number.
+    """Start numba with PyTorch's number of threads, and keep PyTorch's number unchanged.
 
-    If both use OpenMP, starting them sets PyTorch's number to all cores, against the user's choice;
-    sums would then differ before and after the first loop.
+    If both use OpenMP, starting numba's threads resets PyTorch's number to all cores, against the
+    user's choice. Sums before and after the first loop would then differ.
     """
     count = torch.get_num_threads()
     importlib.import_module("numba")
@@ -292,7 +292,7 @@ def threads(count: int) -> Iterator[None]:
 
 
 def name(device: torch.device) -> str:
-    """Name of the inner loops on a device, and the kernels that have failed their trial."""
+    """Implementation of the inner loops on a device, and kernels that failed their trial."""
     probe = torch.empty(0, device=device)
     if gpu_kernels(probe):
         failed = f" (torch for {', '.join(sorted(_refused))})" if _refused else ""

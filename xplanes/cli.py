@@ -23,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Args:
-        arguments: What follows ``xplanes``; taken from the command line when None.
+        arguments: Arguments after ``xplanes``; those of the command line when None.
 
     Returns:
         The exit code: 0, 1 after a reported error, 130 after Ctrl-C.
@@ -88,7 +88,7 @@ class Command(NamedTuple):
     """A command of the program.
 
     Attributes:
-        text: What it does, for the help.
+        text: Help text.
         arguments: Positional arguments and options by name, as `add_argument` takes them.
         run: Runs it with the parsed options; None where Hydra reads the command line.
     """

@@ -1,4 +1,4 @@
-"""Builds objects from nodes of a configuration: the only place where classes are named by text."""
+"""Builds objects from configuration nodes; no other module resolves class names."""
 
 import importlib
 import re
@@ -79,7 +79,7 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
         **more: Further arguments.
 
     Raises:
-        ConfigError: If the class is not allowed here, or refuses its arguments.
+        ConfigError: If the class is not allowed here, or rejects its arguments.
     """
     from hydra.errors import InstantiationException
     from hydra.utils import instantiate

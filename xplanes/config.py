@@ -85,7 +85,7 @@ def group_options(group: str, overrides: Sequence[str] = ()) -> list[str]:
 
 @contextmanager
 def _hydra(name: str | None, overrides: Sequence[str]) -> Iterator[None]:
-    """A separate Hydra whose errors suggest names close to an unknown one."""
+    """Initialise a separate Hydra; its errors suggest names similar to an unknown one."""
     from hydra.errors import HydraException
 
     try:
@@ -103,7 +103,7 @@ def _initialized() -> Iterator[None]:
     from hydra.core.plugins import Plugins
     from hydra.core.singleton import Singleton
 
-    Plugins.instance()  # Before the state is saved, as plug-ins register themselves in it.
+    Plugins.instance()  # Plug-ins register themselves in the state that is saved next.
     # Inside a job Hydra is already initialised; its state is restored afterwards.
     outer = Singleton.get_state()
     GlobalHydra.instance().clear()
@@ -129,7 +129,7 @@ def to_plain(config: Any) -> dict[str, Any]:
 
 
 def key_and_value(override: str) -> tuple[str, str]:
-    """Key and value of an override; the key is empty for anything else."""
+    """Key and value of an override; both are empty for any other argument."""
     key, equals, value = override.partition("=")
     return (key.lstrip("+~"), value) if equals and not key.startswith("-") else ("", "")
 
@@ -267,7 +267,7 @@ def _names(node: Any, prefix: str = "") -> Iterator[str]:
 
 
 def _options_with(key: str, groups: Sequence[str]) -> list[str]:
-    """Options of some groups whose files set a key."""
+    """Options of the given groups whose files set ``key``."""
     import yaml
 
     return sorted(

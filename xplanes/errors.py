@@ -51,7 +51,7 @@ SHOWN = 5
 
 
 def refuse_all(problems: Sequence[str]) -> None:
-    """Report all problems of a capture in one error, if there are any.
+    """Report the problems of a capture, if there are any, in one error.
 
     Raises:
         SceneError: With the first problems, and their number.
@@ -64,7 +64,7 @@ def all_of(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Re
     """The results of a function for all items.
 
     Raises:
-        SceneError: If it fails for some items; with all of their problems, see `refuse_all`.
+        SceneError: If it fails for some items; reports their problems as `refuse_all` does.
     """
     results: list[Result] = []
     problems: list[str] = []

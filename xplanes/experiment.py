@@ -29,7 +29,7 @@ class Experiment:
     """The settings of a run, checked.
 
     Attributes:
-        config: The configuration that they come from.
+        config: The configuration from which they were read.
         method: Model, initialisation and losses.
         data: The scene.
         trainer: Arguments of the Trainer.
@@ -48,12 +48,12 @@ class Experiment:
 
     @classmethod
     def read(cls, config: Mapping[str, Any], modules: Sequence[str] | None = None) -> "Experiment":
-        """The experiment of a configuration.
+        """Read the experiment from a configuration.
 
         Args:
             config: The resolved configuration, builtins only.
-            modules: The user's own modules whose classes it may name; None allows those that the
-                configuration lists, which is unsafe for files from others.
+            modules: The user's own modules whose classes it may name. None: those it lists under
+                ``plugins``, which is unsafe for configurations from others.
 
         Raises:
             ConfigError: If settings are missing, out of range, or contradict one another.
@@ -79,7 +79,7 @@ class Experiment:
 
     @property
     def device(self) -> torch.device:
-        """Where the field is trained.
+        """Device on which the field is trained.
 
         Raises:
             ConfigError: If the machine lacks the device.
@@ -91,7 +91,7 @@ class Experiment:
 
     @property
     def devices(self) -> int:
-        """Processes that share the run."""
+        """Number of processes that share the run."""
         devices = self.trainer.get("devices", 1)
         return devices if isinstance(devices, int) and devices > 0 else 1
 
@@ -99,7 +99,7 @@ class Experiment:
         """The Trainer, with callbacks and loggers, for a run directory.
 
         Raises:
-            ConfigError: If one of them refuses its arguments.
+            ConfigError: If one of them rejects its arguments.
         """
         if self.devices > 1 and self.trainer.get("strategy", "auto") == "auto":
             raise ConfigError(
@@ -136,7 +136,7 @@ def _logger(name: str, node: Mapping[str, Any], run: Path) -> Logger:
     first curve is written. They are rejected here instead.
 
     Raises:
-        ConfigError: If it refuses its arguments.
+        ConfigError: If it rejects its arguments.
     """
     key = f"logger.{name}"
     cls = class_of(node.get("_target_"), Logger, f"{key}._target_")

@@ -86,10 +86,10 @@ def is_there(path: Path) -> bool:
 
 
 def stand_in(path: Path) -> str | None:
-    """If a file is only a placeholder for the real one, why, and what to do; otherwise None.
+    """Why a file is only a placeholder for the real one, and the remedy; None if it is not.
 
     Args:
-        path: A file that cannot be read.
+        path: The file; None is returned if it cannot be opened.
     """
     try:
         with path.open("rb") as file:
@@ -113,7 +113,7 @@ def require_writable(folder: Path) -> None:
     """Refuse a folder in which no file can be written; it need not exist yet.
 
     Raises:
-        StorageError: If it cannot.
+        StorageError: If no file can be written.
     """
     place = existing(folder.absolute())
     try:
@@ -131,7 +131,7 @@ def require_empty(folder: Path) -> None:
     """Refuse a path that is a file or a folder with files; it need not exist yet.
 
     Raises:
-        ConfigError: If it does.
+        ConfigError: If it is a file, or a folder with files.
     """
     if folder.is_file():
         raise ConfigError(f"{folder} is a file: name a folder")
@@ -172,7 +172,7 @@ def clear_unfinished(folder: Path, older_than: float = 0.0) -> None:
 
     Args:
         folder: Searched recursively.
-        older_than: Age in seconds below which a file may still be in use.
+        older_than: Least age in seconds of removed files; newer ones may still be in use.
     """
     for path in folder.rglob(f".*{MARK}*"):
         try:

@@ -55,7 +55,7 @@ def _is_key(word: str) -> bool:
 
 
 def _in_shell(text: str) -> str:
-    """A word as it is typed in a shell: in double quotes, as in the manual, where possible."""
+    """Quote a word for the shell if needed, in double quotes (as in the manual) if possible."""
     plain = shlex.quote(text) == text or set(text) & set('"$`\\!')
     return shlex.quote(text) if plain else f'"{text}"'
 

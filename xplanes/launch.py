@@ -15,7 +15,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-import hydra_plugins.xplanes  # noqa: F401  # Processes of launchers resolve run directories with it.
+import hydra_plugins.xplanes  # noqa: F401  # Launchers' processes need its resolvers.
 from xplanes import __version__
 from xplanes.config import (
     CONF,
@@ -81,11 +81,11 @@ def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
 
 
 _prepared: dict[str, Any] = {}
-"""Jobs that the check has prepared, by run directory, so that they are not prepared twice."""
+"""Jobs that `SettingsCheck` has prepared, by run directory, so that they are prepared once."""
 
 
 class SettingsCheck(Callback):
-    """Refuses invalid settings before Hydra makes the run directory; jobs of a sweep do so later.
+    """Checks settings before Hydra makes the run directory; jobs of a sweep are checked later.
 
     Hydra turns exceptions in callbacks into warnings, hence ``sys.exit``.
     """
@@ -184,7 +184,7 @@ def _require_same_job(folder: Path, overrides: Iterable[str]) -> None:
 
 
 def _may_differ(override: str) -> bool:
-    """Whether a resumed run may change this setting: its budget, what it writes, and where."""
+    """Whether a resumed run may change this setting: of the Trainer, its outputs or its folder."""
     return not override or key_and_value(override)[0].split(".")[0] in (
         *("resume", "hydra", "trainer", "callbacks", "logger", "media", "viewer"),
     )
@@ -238,7 +238,7 @@ def prepare(arguments: list[str]) -> list[str]:
 
 
 def _resumed(run: Path, arguments: list[str]) -> list[str]:
-    """The run's own overrides, then the new ones, in the run's own folder."""
+    """A run's overrides, the new ones that replace or extend them, and its folder."""
     path = run / "overrides.txt"
     if not path.is_file():
         found = _newest(Path("outputs"), "overrides.txt")
@@ -328,7 +328,7 @@ def _without_resume(overrides: Iterable[str]) -> list[str]:
 
 
 def _newest(outputs: Path, name: str) -> list[Path]:
-    """Files of a name in the folders of runs, the newest first."""
+    """Files called ``name`` in run directories, newest first."""
     return sorted(outputs.glob(f"*/{name}"), key=lambda p: p.stat().st_mtime, reverse=True)
 
 

@@ -22,9 +22,9 @@ def psnr(prediction: Tensor, truth: Tensor, shown: Tensor | None = None) -> floa
 
 
 def ssim(prediction: Tensor, truth: Tensor, shown: Tensor | None = None) -> float:
-    """Structural similarity of one image in [0, 1], Gaussian window of 11 with sigma 1.5.
+    """Structural similarity of one image in [0, 1]; Gaussian window of 11 pixels, sigma 1.5.
 
-    Images below 11 pixels a side have no window to slide and score NaN.
+    NaN if a side of the image is shorter than the window.
 
     Args:
         prediction: Rendered image. [H, W, 3]
@@ -38,14 +38,14 @@ def ssim(prediction: Tensor, truth: Tensor, shown: Tensor | None = None) -> floa
 
 
 def dissimilarity(prediction: Tensor, truth: Tensor) -> Tensor:
-    """1 - SSIM as a term of a loss, differentiable; 0 for images below 11 pixels a side. []"""
+    """1 - SSIM as a term of a loss, differentiable; 0 if a side is below 11 pixels. []"""
     if min(truth.shape[:2]) < 11:
         return prediction.new_zeros(())
     return 1 - _similarity(prediction, truth).mean()
 
 
 def _similarity(prediction: Tensor, truth: Tensor) -> Tensor:
-    """Similarity of the window around each pixel, the mean over channels. [H, W]"""
+    """SSIM of the window around each pixel, averaged over channels. [H, W]"""
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     first, second = (t.float().permute(2, 0, 1)[None] for t in (prediction, truth))

@@ -1,6 +1,6 @@
 """This process: start time, OpenMP threads, oneDNN's cache, home directory, command line.
 
-Must not import torch: its libraries read the environment, which is set here, once.
+Must not import torch: its libraries read the environment only once, so it must be set before.
 """
 
 import ctypes
@@ -35,7 +35,7 @@ Without it some libraries fail, and others write into a folder called ``~``.
 
 
 def defaults(environment: Mapping[str, str]) -> dict[str, str]:
-    """Environment variables to add; those in `WAIT` work together, and are added if none is set."""
+    """Environment variables to add; a group is left out if any of its variables is set."""
     try:
         Path.home()
         groups = [WAIT, KEEP]
@@ -50,13 +50,13 @@ def defaults(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 MMAP_THRESHOLD, TRIM_THRESHOLD = (-3, 2**30), (-1, 2**31 - 1)
-"""Options of glibc's ``mallopt``: sizes above which blocks, and free memory, are released."""
+"""Options of glibc's ``mallopt``, with sizes in bytes above which freed memory is returned."""
 
 
 def keep_freed_memory() -> None:
     """Let glibc reuse freed memory instead of returning it to the system.
 
-    With large batches, new pages for temporaries take a tenth of each step's time. Nothing changes
+    With large batches, page faults for temporaries take a tenth of each step's time. Has no effect
     with other C libraries, or if the user has set one of glibc's own variables.
     """
     if any(name.startswith("MALLOC_") or name == "GLIBC_TUNABLES" for name in os.environ):

@@ -58,7 +58,7 @@ class Job:
         experiment: The settings.
         trainer: The Trainer, with callbacks and loggers.
         folder: The run directory, which need not exist yet.
-        new: Whether it did not exist.
+        new: Whether the folder did not exist yet.
     """
 
     experiment: Experiment
@@ -187,7 +187,7 @@ def train(
     loaded = time.perf_counter() - warm_up.seconds - began
 
     # Initialisation and field
-    # Built before the initialisation: Lightning keeps the local variables of its caller alive.
+    # Created before the large initialisation: Lightning keeps its caller's local variables alive.
     module = RadianceModule(method)
     place = Place(scene, frame, device, experiment.devices, say, hints)
     found = initialisation_of(method, source, place)
@@ -196,7 +196,7 @@ def train(
     module.build(scene, frame, device=device, initialisation=found)
     loaded += time.perf_counter() - warm_up.seconds - began
     found = module.initialisation or found  # Without the sparse part, which the model frees.
-    loaded -= found.seconds["fill"]  # Filling the grid of an initialised field is preparation.
+    loaded -= found.seconds["fill"]  # Counted as preparation.
 
     # Training
     if record is not None:

@@ -1,7 +1,7 @@
 """Typed settings: dataclasses that check types, ranges and choices when they are built.
 
-A component of a run is such a class and a YAML file that names it as ``_target_``. Must import
-fast, hence without torch and Hydra.
+Each component of a run has such a class, which YAML files name as ``_target_``. Must import fast,
+hence without torch and Hydra.
 """
 
 import difflib
@@ -21,8 +21,8 @@ class Range:
     """Bounds of a number.
 
     Attributes:
-        low: Least value, or the value above which it must lie.
-        high: Largest value, or the value below which it must lie.
+        low: Lower bound.
+        high: Upper bound.
         open: Whether the bounds themselves are excluded.
     """
 

@@ -22,7 +22,7 @@ class Stream(IntEnum):
     INITIAL_FIELD = 1_000_033
     """Initial values of X-Planes."""
     FRAMES = 1_000_037
-    """Timesteps at which L_r is taken."""
+    """Timesteps at which L_r is evaluated."""
     JITTER = 1_000_039
     """Positions of samples, for samplers that need more than one number per ray."""
     TURNTABLE = 1_000_061
@@ -34,7 +34,7 @@ class Stream(IntEnum):
     SAMPLER = 1_000_117
     """Initial values of samplers that learn."""
     NEARBY = 1_000_151
-    """Directions in which Tensor4D's features must not change."""
+    """Directions of the offsets over which Tensor4D's loss compares features."""
     PRETRAINING = 1_000_211
     """Positions of samples in the pretraining of LRMs."""
     NOISE = 1_000_271
@@ -89,7 +89,7 @@ def counted_uniform(
         device: Device of the result; it is not synchronised with the host.
 
     Returns:
-        Multiples of 2^-53 below 1. float64 [...]
+        Multiples of 2^-53 in [0, 1). float64 [...]
 
     Source: Steele, Lea and Flood, Fast Splittable Pseudorandom Number Generators (splitmix64).
     """
@@ -127,8 +127,8 @@ class TrainingState:
         seed: The run's seed.
         step: Optimiser steps done.
         batch: Batches drawn before this one.
-        rank: Number of this process among those that split the rays.
-        progress: Share of the budget that has been used.
+        rank: Rank of this process among those that split the rays.
+        progress: Share of the training budget that has been used.
     """
 
     seed: int

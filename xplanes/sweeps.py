@@ -72,8 +72,8 @@ def look_ahead(config: DictConfig) -> str:
         config: The configuration of the multirun.
 
     Returns:
-        How many runs there are and how long they train; empty if the sweeper is not over a grid,
-        or if Hydra itself is going to report an error.
+        A line with the number of runs and their training time; empty if the sweeper is not over a
+        grid, or if Hydra itself will report an error.
 
     Raises:
         ConfigError, SceneError, LRMError: If sweeps cannot be run together, or data or weights are

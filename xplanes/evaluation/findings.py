@@ -50,7 +50,7 @@ class Finding:
 
 
 def stray_pixels(alpha: Tensor) -> int:
-    """Number of pixels with alpha away from the silhouette: noise rather than soft edges."""
+    """Number of pixels with alpha above 0 away from the silhouette: noise, not soft edges."""
     side = max(1, round(HALO * max(alpha.shape)))
     held = count_in_squares(silhouette_of(alpha), side) > 0
     near = F.max_pool2d(held.float()[None], 3, stride=1, padding=1)[0] > 0
@@ -149,7 +149,7 @@ def _times(scene: Scene, train: Views) -> Iterator[Finding]:
 
 
 def _same_camera_other_image(views: Views) -> tuple[int, int] | None:
-    """Two images of one pose that differ."""
+    """Indices of two views with the same pose whose images differ; None if there are none."""
     groups: dict[bytes, int] = {}
     for index, pose in enumerate(views.camera_to_world):
         other = groups.setdefault(pose.contiguous().numpy().tobytes(), index)
@@ -253,7 +253,7 @@ def pixels_of(views: Views, index: int, points: Tensor) -> tuple[Tensor, Tensor,
 
 
 def sees_centre(views: Views, frame: Frame) -> Tensor:
-    """Whether each camera has the centre of the cube in its image. bool [V]"""
+    """Whether each camera sees the centre of the cube. bool [V]"""
     found = torch.zeros(len(views), dtype=torch.bool)
     for index in range(len(views)):
         column, row, seen = pixels_of(views, index, frame.centre[None])

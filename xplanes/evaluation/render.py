@@ -49,8 +49,8 @@ def render_path(
         times: Time of each frame, from 0 to 1. [F]
         background: Colour behind the scene. [3]
         what: ``colour``, or ``depth`` as colours on the same scale in all frames.
-        shown: Pixels for which the lens has a ray, the others are empty; all when None. bool
-            [rows, columns]
+        shown: Mask of pixels that have a ray through the lens; the others are left empty. All
+            when None. bool [rows, columns]
 
     Yields:
         Pictures. uint8 [rows, columns, 3]
@@ -84,8 +84,8 @@ def check_video(path: Path, *, frames: int, folder: bool = False) -> None:
         folder: Whether ``path`` is a folder for one PNG per frame.
 
     Raises:
-        ConfigError: If the suffix is unknown, the folder is not empty, or an image would get
-            several frames.
+        ConfigError: If the suffix is unknown, the folder is not empty, or ``path`` is one image
+            for several frames.
         ImportError: For .mp4 without the extra ``video``, naming it.
     """
     if folder:
@@ -153,11 +153,11 @@ FRAMES, FPS = 48, 16
 """Number of frames of a run's video, and frames per second."""
 
 VIDEO_SIZE = 200
-"""Most pixels along the sides of a run's own video."""
+"""Maximum side length in pixels of a run's video."""
 
 
 def video_size(views: Views) -> int:
-    """Pixels along each side of the video of a run that trains on some views."""
+    """Side length in pixels of a run's video, given its training views."""
     return min(VIDEO_SIZE, max(views.height, views.width))
 
 

@@ -157,7 +157,7 @@ def summary(
 
 
 def refined_cameras(module: RadianceModule, views: Views) -> dict[str, Any]:
-    """``cameras``: how far those of the training views moved, and their poses; or nothing."""
+    """Entry ``cameras``: motion and poses of the training cameras; empty if not refined."""
     frame, sampler = module.frame, module.sampler
     if frame is None or not isinstance(sampler, RefiningSampler):
         return {}
@@ -188,7 +188,7 @@ def write_pictures(trainer: Trainer, pictures: Mapping[str, Tensor], *, log: boo
     Args:
         trainer: The Trainer, with run directory and loggers.
         pictures: By name, colours from 0 to 1. [H, W, 3] each
-        log: Whether they go to the loggers too.
+        log: Whether to pass them to the loggers, too.
     """
     for name, picture in pictures.items():
         write_png(Path(trainer.default_root_dir) / "media" / f"{name}.png", picture)
@@ -218,7 +218,7 @@ def log_hparams(trainer: Trainer, experiment: Experiment, metrics: dict[str, Any
                 assert writer.file_writer is not None
                 for summary in hparams(parameters, scores):
                     writer.file_writer.add_summary(summary)
-                for name in scores.keys() - trainer.logged_metrics.keys():  # The rest is logged.
+                for name in scores.keys() - trainer.logged_metrics.keys():  # Others are logged.
                     writer.add_scalar(name, scores[name], metrics["step"])
         else:
             logger.log_hyperparams(parameters)

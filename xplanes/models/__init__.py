@@ -1,1 +1,1 @@
-"""One file a method: its field, losses, parameter groups and schedule."""
+"""X-Planes, the learnt background, and base classes of models and initialisations."""

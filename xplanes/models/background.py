@@ -70,7 +70,7 @@ class BackgroundSettings(Settings):
             )
 
     def groups(self, background: Background) -> list[Group]:
-        """Its trainable parameters."""
+        """Parameter groups of the background."""
         decoder = list(background.decoder.parameters())
         return [
             {"params": [background.planes], "lr": self.plane_lr, "name": "background"},
@@ -82,8 +82,8 @@ class BackgroundSettings(Settings):
     ) -> dict[str, Tensor]:
         """Loss terms of the background by name; empty between evaluations of the prior. [] each
 
-        The decoder is shared by all directions: without the prior, those that no view shows would
-        get arbitrary colours.
+        All directions share the decoder: without the prior, directions that no view shows would get
+        arbitrary colours.
 
         Args:
             background: The background.
@@ -103,7 +103,7 @@ class BackgroundSettings(Settings):
         return {"unseen": UNSEEN_EVERY * self.unseen * error.square().mean()}
 
     def regularise(self, background: Background, every: int = 1) -> None:
-        """Add the gradient of its total variation, scaled by ``every`` steps."""
+        """Add the planes' total variation gradient, times ``every``, the steps between calls."""
         planes = background.planes
         if planes.grad is not None and self.total_variation:
             weight = self.total_variation * every

@@ -189,7 +189,7 @@ class ModelSettings(Settings, ABC):
     def for_scene(self, views: Views, hints: CubeHints = NO_HINTS) -> "ModelSettings":
         """The settings with cube, near and far from the scene, where published ones do not fit it.
 
-        Unchanged by default, for models whose field and sampler take them from the scene.
+        Unchanged by default: the field and the sampler of most models take them from the scene.
 
         Args:
             views: Training views.
@@ -228,7 +228,7 @@ def colour_error(rendering: Rendering, rays: Batch) -> Tensor:
 
 
 def ray_mean(values: Tensor, rays: Batch) -> Tensor:
-    """Mean over rays, unbiased if some pixels were preferred (``weight``). [R] -> []"""
+    """Mean over rays; ``weight``, if any, corrects for importance sampling. [R] -> []"""
     weight = rays.get("weight")
     return values.mean() if weight is None else (weight * values).mean()
 

@@ -38,17 +38,17 @@ class Initialisation:
             whether there are time planes.
         frame: The field's frame: the source's, if it has one, or the scene's.
         values: Planes, decoder and sparse part; None for a random initialisation.
-        report: The decomposition for metrics.json: per orientation, and as ``unexplained`` the
-            share of the sparse part's energy that the time planes do not explain: ``before`` with
-            random planes, ``after`` with the initial ones.
+        report: Decomposition reports for metrics.json, by orientation. ``unexplained``: share of
+            the sparse part's energy that the time planes do not explain, ``before`` with random
+            planes and ``after`` with the initial ones.
         seconds: Seconds of each stage; for a cached stage, those of its original computation.
             ``fill``, the occupancy grid, is added once the field is built.
         description: One-line description.
-        pictures: Images by name, from 0 to 1: both parts at a few timesteps, and the LRM's input.
-            [H, W, 3] each
+        pictures: Images by name, from 0 to 1: the LRM's input, and low-rank and sparse part at a
+            few timesteps. [H, W, 3] each
         lrm: Facts about the LRM's input and frame, for metrics.json.
         skipped: Shares for metrics.json: ``frames`` that equal others and were not encoded, and
-            singular ``directions`` that were not computed.
+            singular ``directions`` of robust PCA below the threshold.
     """
 
     model: ModelSettings
@@ -70,7 +70,7 @@ class Place:
         scene: The scene.
         frame: The frame of the scene, for sources without their own.
         device: Device of the computation.
-        devices: Processes that share the run.
+        devices: Number of processes that share the run.
         say: Prints a line before a slow stage.
         hints: What is known of the scene's cube.
     """
@@ -196,7 +196,7 @@ class Method:
         model: Field, sampler, losses and learning rates.
         lrm: Source of the initialisation.
         preparation: Steps before training.
-        decomposition: Triplanes to planes.
+        decomposition: Decomposition of triplanes, and their conversion to planes.
         losses: Further terms of the loss by name; those of weight 0 are left out.
     """
 

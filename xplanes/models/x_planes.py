@@ -2,7 +2,7 @@
 
 Features of a point (x, y, z) at time t are interpolated in space planes and space-time planes
 (Eq. 14, 15). The decoder maps them to colour and density, which are composited along rays and
-compared with the images. The loss also contains smoothness of the planes and L_r, which keeps
+compared with the images. The loss also contains smoothness regularisers and L_r, which keeps
 products of the space-time planes near the sparse part of the LRM's triplanes (Eq. 17).
 """
 
@@ -44,10 +44,10 @@ FINE_WARMUP = 100
 """Warm-up steps of the fine planes' learning rate."""
 
 TEXELS_PER_PIXEL, TEXEL_STEP, MOST_TEXELS = 0.66, 32, 256
-"""Texels of fine planes with texels=auto: per image pixel, rounded to multiples of, and at most."""
+"""Fine planes with texels=auto: texels per image pixel, rounding step, and maximum of texels."""
 
 FINER = 2.0
-"""Fine planes are used only if they have at least this many times the space planes' texels."""
+"""With texels=auto, fine planes need at least this many times the texels of space planes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,7 +210,7 @@ class XPlanesSettings(ModelSettings):
         return XPlanesModel(self, self.build_field(site, initial), site, initial)
 
     def build_field(self, site: Site, initial: InitialValues | None = None) -> XPlanes:
-        """The field: planes and decoder from the initial values, where given, otherwise random."""
+        """Build planes and decoder from the initial values, if given, otherwise at random."""
         plane_set = self.plane_set if site.moves else "three"
         background = None if self.background is None else self.background.build(site)
         generator = step_generator(site.seed, 0, Stream.INITIAL_FIELD)
@@ -427,7 +427,7 @@ class XPlanesModel(Model):
         return found
 
     def _distance(self) -> float:
-        """Sum over the planes' stacks of the mean squared distance from their initial values."""
+        """Mean squared distance from the initial values, summed over the stacks of planes."""
         pairs = zip(self._planes, self._initial, strict=True)
         return sum(
             float((plane - initial.to(plane.device)).square().mean()) for plane, initial in pairs

@@ -85,7 +85,7 @@ class Parts:
         return cls(settings, site, model, sampler, initialisation)
 
     def stronger(self) -> "Parts":
-        """The parts with another seed and the model's settings for a restart after a collapse."""
+        """Rebuild the parts with another seed and the model's settings for a restart."""
         settings = self.settings.stronger()
         assert settings is not None
         site, found = replace(self.site, seed=self.site.seed + ANOTHER_SEED), self.initialisation
@@ -133,7 +133,7 @@ def build_parts(
     cameras = CameraGroups.of(views, found.frame)
     site = Site(
         frame=found.frame,
-        # For a field without time planes all views have the same time.
+        # All views of a static field have the same time.
         times=torch.zeros_like(views.times) if found.model.is_static else views.times,
         seed=method.seed,
         precision=precision_of(found.model, device),
@@ -155,7 +155,7 @@ def build_parts(
 
 
 def site_content(parts: Parts) -> dict[str, Any]:
-    """What data and LRM determine about a field, as builtins and tensors."""
+    """Properties of a field that depend on the data and the LRM, as builtins and tensors."""
     site = parts.site
     return {
         "model": parts.settings.plain(),
@@ -187,7 +187,7 @@ def parts_from(
     with plugins(modules):
         settings = build(content["model"], ModelSettings, "model")
     if not content["initialised"] or settings.name != method.model.name:
-        settings = method.model  # If it is another model, loading its weights will fail.
+        settings = method.model  # Loading the weights of another model fails later.
     cameras, exposed = (
         None if (groups := content.get(name)) is None else CameraGroups(**groups)
         for name in ("cameras", "exposed")

@@ -1,4 +1,4 @@
-"""Checkpoints: written atomically, and loaded as data."""
+"""Checkpoints: written atomically, and loaded without executing code."""
 
 import io
 import logging
@@ -27,11 +27,11 @@ logger = logging.getLogger(__name__)
 LAST, BEST = "last.ckpt", "best.ckpt"
 
 TENSORS = ("state_dict", "optimizer_states")
-"""Large parts of a checkpoint, which contain only tensors."""
+"""Large parts of a checkpoint, which contain only tensors and plain values."""
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes checkpoints atomically, and loads them as data, with a check of their checksums."""
+    """Writes checkpoints atomically; verifies checksums and executes no code when loading."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
@@ -105,7 +105,7 @@ class Checkpoints(ModelCheckpoint):
         # Never between accumulated batches: checkpoints do not contain gradients.
         whole = getattr(pl_module, "between_updates", True)
         self._due = whole and trainer.global_step % self.every == 0
-        # Before a validation the checkpoint waits for its scores, so that it records the best one.
+        # If a validation follows, save after it, so that the checkpoint records the best score.
         validates = trainer.val_check_batch == trainer.fit_loop.epoch_loop.total_batch_idx + 1
         if self._due and not validates:
             self._save_last(trainer)
@@ -123,7 +123,7 @@ class Checkpoints(ModelCheckpoint):
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
-        # Any other interrupt may have occurred in the middle of a step.
+        # Other exceptions may have occurred in the middle of a step.
         if isinstance(exception, Stopped) and trainer.global_step:
             self._save_last(trainer)
 

@@ -1,4 +1,4 @@
-"""The training clock, and the end of training by it."""
+"""The training clock, which ends training after a time limit."""
 
 import time
 from collections.abc import Iterator
@@ -15,8 +15,7 @@ C = TypeVar("C", bound=Callback)
 
 
 SHARED = 8
-"""Batches between synchronisations of a distributed run's processes: of their clocks, and of
-requests to stop."""
+"""Batches after which the processes of a distributed run synchronise clocks and stop requests."""
 
 
 def agreeing(trainer: Trainer) -> bool:
@@ -27,10 +26,10 @@ def agreeing(trainer: Trainer) -> bool:
 
 
 class TrainingClock(Callback):
-    """Counts the seconds spent on training, and ends training when they are used up.
+    """Counts the seconds spent on training, and ends training after ``max_seconds``.
 
-    Drawing rays counts, and so does work queued on a GPU. Validation, scores, images and
-    checkpoints do not: they run inside `off_clock`. Works in any Trainer.
+    Drawing rays and work queued on a GPU count. Validation does not, nor do blocks inside
+    `off_clock`, such as writing images and checkpoints. Works in any Trainer.
 
     Args:
         max_seconds: Seconds after which training ends; None for no limit.

@@ -13,7 +13,7 @@ from xplanes.training.module import RadianceModule
 logger = logging.getLogger(__name__)
 
 WINDOW = 100
-"""Steps over which opacities are averaged."""
+"""Batches over which opacities are averaged."""
 
 NOTHING = 0.05
 """Mean opacity of foreground rays below which a field counts as empty."""
@@ -36,7 +36,7 @@ class CollapseWatch(Callback):
         restarts: Maximum number of re-initialisations; 0 for a warning only.
 
     Attributes:
-        restarted: Steps of re-initialisations.
+        restarted: Steps at which the field was re-initialised.
         collapsed: Description of the last collapse; empty if there was none.
     """
 
@@ -94,10 +94,10 @@ class CollapseWatch(Callback):
 
 
 def verdict(seen: list[tuple[float, float]], *, fog: bool) -> str:
-    """Diagnosis by mean opacities of foreground and background rays; empty if there is no collapse.
+    """Diagnose a collapse by mean opacities of foreground and background rays; empty if none.
 
     Args:
-        seen: One pair for each step, from 0 to 1; NaN if a batch had no such rays.
+        seen: One pair per batch, from 0 to 1; NaN if a batch had no such rays.
         fog: Whether to check for fog.
     """
     foreground, background = (

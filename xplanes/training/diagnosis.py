@@ -21,8 +21,8 @@ class TrainingError(XPlanesError, RuntimeError):
 def usable(gradient: Tensor) -> bool:
     """Whether an optimiser can use a gradient: the sum of its squares is finite.
 
-    Adam accumulates the squares. One that overflows would stay infinite and freeze its parameter,
-    without a NaN anywhere.
+    Adam keeps a running average of the squares. After an overflow it would stay infinite and
+    freeze its parameter, without any NaN.
     """
     if gradient.is_contiguous():
         flat = gradient.view(-1)
@@ -64,7 +64,7 @@ def unusable_gradients(named: Iterable[tuple[str, nn.Parameter]]) -> list[str]:
 
 def not_finite(named: Iterable[tuple[str, Tensor]]) -> list[str]:
     """Names of the tensors that contain a NaN or an infinity."""
-    # Times 0, NaN and infinity become NaN; the plain sum of finite numbers could overflow.
+    # NaN * 0 and infinity * 0 are NaN; a plain sum of finite numbers could overflow.
     return [name for name, tensor in named if not bool((tensor.detach() * 0).sum() == 0)]
 
 
@@ -90,7 +90,7 @@ def diagnosis(
     density, parameters = rendering.density, not_finite(module.named_parameters())
     seen = {"colour": rendering.colour, "opacity": rendering.opacity, "density": density}
     rays = [f"rendered {name}" for name in not_finite(seen.items())]
-    # Named by its setting if it was added with ``losses``, else by its name in the model.
+    # Terms of the group ``losses`` are named by their setting.
     losses = [
         f"losses.{name}" if name in module.method.losses else f"loss term {name}"
         for name in not_finite(terms.items())
@@ -122,7 +122,7 @@ def require_finite(module: "RadianceModule") -> None:
 def _way_out(
     module: "RadianceModule", broken: Sequence[str] = (), *, rendered: bool = False
 ) -> str:
-    """Advice if these terms are not finite; ``rendered``: the rendering itself is finite."""
+    """Advice for ``broken`` loss terms; ``rendered``: parameters and rendering are finite."""
     added = [f"losses.{name}" for name in module.method.losses] if rendered else []
     begun = module.tally.done > 0
     resume = "; resume= continues from the last checkpoint" if begun else ""

@@ -34,7 +34,7 @@ def affordable(
     """Shares of the budget at which to evaluate, and limit on the number of views.
 
     In scenes with surroundings the whole cube may be occupied at first, and a view takes seconds to
-    render: by default fewer views are scored, and after step 0 none until surfaces are opaque.
+    render. By default fewer views are scored, and none between step 0 and `FIRST_SHARE`.
 
     Args:
         at: Shares of the budget at which to evaluate.
@@ -88,7 +88,7 @@ class Evaluation(Callback):
         if trainer.global_step and trainer.is_global_zero:
             forget_later(trainer, trainer.global_step)
         passed = sum(share <= pl_module.progress for share in self.at)
-        # A run stopped during an evaluation repeats it; a larger budget has passed fewer shares.
+        # A run stopped during an evaluation repeats it; a larger budget lowers the progress.
         self._passed = passed if self._passed is None else min(self._passed, passed)
 
     def on_train_batch_end(
@@ -99,7 +99,7 @@ class Evaluation(Callback):
         due = sum(share <= pl_module.progress for share in self.at) > self._passed
         ends = pl_module.progress >= 1
         if (due or ends) and pl_module.between_updates:
-            # Lightning validates after multiples of this number of batches, hence now.
+            # Lightning validates after multiples of this number of batches, so it does so now.
             trainer.val_check_batch = trainer.fit_loop.epoch_loop.total_batch_idx + 1
         else:
             trainer.val_check_batch = sys.maxsize

@@ -138,7 +138,7 @@ class Trainer(lightning.Trainer):
                 raise ConfigError(f"callbacks: EarlyStopping: {error}") from error
             evaluation = find_callback(self, Evaluation)
             if evaluation is not None and evaluation.step != self.global_step:
-                # With no steps left Lightning skips validation, but the end may not be scored yet.
+                # Lightning skips validation if no steps are left, even if the end is not scored.
                 self.validate(module, data, verbose=False)
         module.to(device)  # Lightning moves it back to the CPU after training.
 
@@ -195,7 +195,7 @@ def fit_quietly(
         accelerator="gpu" if device.type == "cuda" else "cpu",
         max_steps=max_steps,
         max_seconds=max_seconds,
-        # A Trainer sets this for the whole process: keep the setting of the run's own Trainer.
+        # Affects the whole process: keep the setting of the run's own Trainer.
         deterministic=device.type == "cpu" and torch.are_deterministic_algorithms_enabled(),
         tf32=torch.backends.cudnn.allow_tf32,
         callbacks=[CollapseWatch(), Checkpoints(every=250)],
@@ -253,7 +253,7 @@ class Estimate(NamedTuple):
     """Expected durations, measured before the first step.
 
     Attributes:
-        step: Seconds per step, once the number of rays fits the samples of a batch.
+        step: Seconds per step, once the number of rays fits the batch's budget of samples.
         first_ray: Seconds per ray of an image of the untrained field.
         later_ray: Seconds per ray once surfaces are opaque and empty space is pruned.
         pruned_at: First step at which empty space is pruned.
@@ -272,16 +272,16 @@ class Estimate(NamedTuple):
 
 
 WHOLE_STEP = 1.45
-"""A step's time, relative to that of rendering its rays and of the gradients.
+"""Ratio of a step's time to that of rendering its rays and backpropagating.
 
 The rest is drawing rays, the optimiser, regularisers, the occupancy grid and Lightning's loop: a
 third of the training of the demo scene (docs/results/records/time.json).
 """
 
 HALF_OPAQUE = 85
-"""Steps in which the extra cost of images of an untrained field halves, as surfaces become opaque.
+"""Steps after which the extra time per image of an untrained field halves, as surfaces form.
 
-Measured on a capture with surroundings, of which no cell is pruned in the first 800 steps.
+Measured on a capture with surroundings, in which no cell is pruned in the first 800 steps.
 """
 
 OPAQUE = 1000.0
@@ -294,15 +294,15 @@ BEHIND = 0.5
 def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
     """Time a step, and some rays of a validation view.
 
-    In a trained field surfaces are opaque, so that rays end after a few samples. It is approximated
-    by a copy of the field with a much higher density.
+    In a trained field surfaces are opaque, so rays end after a few samples. A copy of the field
+    with a much higher density approximates it.
     """
     frame, field, renderer = module.frame, module.field, module.renderer
     assert frame is not None
     device = next(field.parameters()).device
     batches = data.batches_for(module, 0)
     rays = _moved(batches.draw(0, module.rays), device)
-    if module.rays:  # Batches soon have as many rays as their samples allow.
+    if module.rays:  # Batches soon have as many rays as the budget of samples allows.
         with torch.no_grad():
             samples = module.sampler.render(field, rays, module.state).samples
         count = module.ray_settings.fitting(module.rays, int(samples.count))
@@ -348,7 +348,7 @@ def _moved(batch: Batch, device: torch.device) -> Batch:
 
 
 def quiet_lightning() -> None:
-    """Hide messages of Lightning that a user of this program cannot act on."""
+    """Hide messages of Lightning on which users cannot act."""
     for name in (
         "utilities.rank_zero",
         "trainer.connectors.checkpoint_connector",

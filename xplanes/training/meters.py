@@ -55,8 +55,8 @@ class Meters:
 
 
 COUNTS = ("rays", "candidates", "empty", "occluded", "samples", "no_room")
-"""Counts of a run: rays, samples in their box, those dropped as empty or occluded, remaining ones,
-and rays left out on a GPU because their samples did not fit."""
+"""Counts of a run: rays, candidate samples in the bounding box, candidates skipped as empty or
+occluded, remaining samples, and rays left out on a GPU because their samples did not fit."""
 
 
 class Tally:
@@ -83,7 +83,7 @@ class Tally:
         self._batches.add(values)
 
     def add_update(self, broken: Tensor) -> None:
-        """Add an update, which was skipped if the flag is 1. []"""
+        """Add an update; ``broken`` is 1 if it was skipped. []"""
         self._updates.add({"updates": 1, "skipped": broken})
         if broken.device.type == "cpu":
             self._read_updates()

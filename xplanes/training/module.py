@@ -56,8 +56,8 @@ OPACITIES = 5
 class RadianceModule(ViewScoring):
     """Trains a field on rays, supervised by the images' colours.
 
-    The field is built in `configure_model`, when the scene is known; an LRM, if configured, runs
-    there, too. Checkpoints store what the data and the LRM determine about the field, so that
+    The field is built in `configure_model`, when the scene is known; a configured LRM runs there,
+    too. Checkpoints include all that the field takes from the data and the LRM, so that
     ``RadianceModule.load_from_checkpoint(path)`` needs only the file (and ``plugins``, if used).
 
     A step is `training_step` (render the rays, sum the loss terms), `on_before_optimizer_step`
@@ -252,7 +252,7 @@ class RadianceModule(ViewScoring):
 
     @property
     def progress(self) -> float:
-        """Share of training that is done, in steps or by a callback's budget."""
+        """Share of training that is done, by steps or by the budget of a callback."""
         share = self.global_step / self._steps
         return min(1.0, max([share, *(callback.progress for callback in self._schedules)]))
 
@@ -264,12 +264,12 @@ class RadianceModule(ViewScoring):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         groups = [*self.model.groups(), *self.sampler.groups()]
-        # Not read from the optimiser's state: a resumed run restores it, but may change settings.
+        # Not from the optimiser's restored state, because a resumed run may change the rates.
         self._peaks = [group["lr"] for group in groups]
         return self.model.optimizer(groups)
 
     def on_fit_start(self) -> None:
-        # Not in on_train_start, because callbacks read `progress` in theirs, which run earlier.
+        # Not in on_train_start: callbacks' on_train_start runs before it and reads `progress`.
         trainer = self.trainer
         self._steps = max(1, trainer.estimated_stepping_batches)
         callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
@@ -336,10 +336,10 @@ class RadianceModule(ViewScoring):
     ) -> None:
         state = self.state
         super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
-        # Here rather than after the batch, so that checkpoints of callbacks contain the update.
+        # Not in on_train_batch_end, so that checkpoints of callbacks contain the update.
         self.sampler.update(self.field, state)
         self.between_updates = True
-        self._seen = None  # Its graph would keep parameters alive that a model replaces.
+        self._seen = None  # Its graph would keep replaced parameters alive.
 
     def on_train_end(self) -> None:
         self._read_tally()
@@ -416,7 +416,7 @@ class RadianceModule(ViewScoring):
             self.restarts = progress["restarts"]
             self.batches, self.rays = progress["batches"], progress["rays"]
             self.tally.load_state_dict(progress)
-            if "error_map" in checkpoint:  # Absent in those of earlier versions.
+            if "error_map" in checkpoint:  # Absent in checkpoints of earlier versions.
                 self.error_map.load_state_dict(checkpoint["error_map"])
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigError(

@@ -117,10 +117,10 @@ class RunRecord:
 
 
 def claim(run: Path, *, resume: bool) -> None:
-    """Refuse a folder that contains a run with a checkpoint, unless it is to be resumed.
+    """Refuse a folder with a finished run or a checkpoint, unless that run is to be resumed.
 
     Raises:
-        ConfigError: If there is a run and ``resume`` is false, or no run and it is true.
+        ConfigError: For such a run without ``resume``, or ``resume`` without a run.
     """
     path, status = run / "run.json", None
     if path.is_file():
@@ -275,7 +275,7 @@ class _LogFile(logging.FileHandler):
 
 
 def _own_warning(record: logging.LogRecord) -> bool:
-    """Whether a record is a warning of this package; Python's warnings begin with their file."""
+    """Whether a record is a warning of this package; Python's warnings start with a file path."""
     ours = record.name.startswith("xplanes") or (
         record.name == "py.warnings" and f"{Path(xplanes.__file__).parent}" in record.getMessage()
     )

@@ -196,7 +196,7 @@ class ViewScoring(LightningModule):
     @property
     @abstractmethod
     def shared_parts(self) -> list[nn.Module]:
-        """Modules whose buffers differ between the processes of a run while they train."""
+        """Modules whose buffers differ between processes during training."""
 
     def predict_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
         """One view: ``colour`` [H, W, 3], ``opacity`` and ``depth`` [H, W]."""
@@ -205,7 +205,7 @@ class ViewScoring(LightningModule):
         return render_item(self.field, self.renderer, frame, batch)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
-        """The rendered view; its scores are logged at the end, with those of the others."""
+        """Render and score a view; the mean scores are logged at the end of the epoch."""
         image = self.predict_step(batch, batch_idx)
         self.scores.append(score_image(image, batch))
         self._tag = batch["tag"]
@@ -233,9 +233,9 @@ class ViewScoring(LightningModule):
     on_test_epoch_end = on_validation_epoch_end
 
     def agree(self) -> None:
-        """Copy the first process's sampler to all: each has observed only its own rays.
+        """Copy the sampler's buffers from the first process to all others.
 
-        All processes then score and save the same field.
+        Each has observed only its own rays; afterwards all score and save the same field.
         """
         if self._trainer is None or self._trainer.world_size == 1:
             return

@@ -15,16 +15,14 @@ from lightning import seed_everything
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from xplanes.backend import warm_up
-from xplanes.errors import ConfigError, SceneError, XPlanesError
+from xplanes.errors import XPlanesError
 from xplanes.evaluation.findings import scene_findings
 from xplanes.evaluation.render import FRAMES, write_orbit
 from xplanes.evaluation.report import closing, header, log_hparams, rest, summary, write_pictures
 from xplanes.experiment import Experiment
 from xplanes.files import StorageError, clear_unfinished, storage_error, write_json
 from xplanes.locks import alone_in
-from xplanes.lrm import LRMError
 from xplanes.models.initialisation import Place, initialisation_of
-from xplanes.optional import MissingExtraError
 from xplanes.process import resume_command, say
 from xplanes.scenes.datamodule import SceneDataModule, found_root
 from xplanes.training.checkpoints import find_resumable, has_checkpoint
@@ -33,6 +31,7 @@ from xplanes.training.evaluation import Evaluation
 from xplanes.training.fit import Trainer, estimate, warm_up_loops
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import (
+    REFUSALS,
     RunRecord,
     claim,
     keeping_settings,
@@ -45,9 +44,6 @@ logger = logging.getLogger(__name__)
 
 KNOWN_ERRORS = (XPlanesError, MisconfigurationException)
 """Errors reported by their message alone; the traceback is written to train.log only."""
-
-REFUSALS = (ConfigError, SceneError, LRMError, MissingExtraError)
-"""Errors in settings, data or weights: the run cannot begin."""
 
 
 @dataclass(frozen=True)

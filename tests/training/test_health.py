@@ -17,6 +17,7 @@ from xplanes.errors import ConfigError
 from xplanes.files import read_rows
 from xplanes.models.base import LossTerm
 from xplanes.models.x_planes import XPlanesModel
+from xplanes.optional import MissingExtraError
 from xplanes.run import run
 from xplanes.training import building, module
 from xplanes.training.checkpoints import find_resumable, load_checkpoint
@@ -29,6 +30,7 @@ from xplanes.training.diagnosis import (
     usable,
 )
 from xplanes.training.module import RadianceModule
+from xplanes.training.record import claim, keeping_settings
 
 LONG = ("trainer.max_steps=40", "callbacks.checkpoints.every=5", "callbacks.evaluation.at=[]")
 """More steps than may be left out in a row."""
@@ -292,6 +294,22 @@ def test_a_sound_checkpoint_that_cannot_be_read_is_not_called_damaged(tmp_path):
         pytest.raises(ConfigError, match=r"last\.ckpt cannot be read: Permission denied$"),
     ):
         load_checkpoint(path)
+
+
+def test_checkpoints_without_a_record_are_not_overwritten(tmp_path):
+    save = tmp_path / "checkpoints/last.ckpt"
+    save.parent.mkdir()
+    save.write_bytes(b"")
+    with pytest.raises(ConfigError, match=r"holds checkpoints, but no run\.json\. Choose another"):
+        claim(tmp_path, resume=False)
+
+
+@pytest.mark.parametrize("refusal", [ConfigError, MissingExtraError])
+def test_a_refused_resume_keeps_the_earlier_settings(tmp_path, refusal):
+    (tmp_path / "config.yaml").write_text("seed: 1\n")
+    with pytest.raises(refusal), keeping_settings(tmp_path, {"seed": 2}, ["seed=2"]):
+        raise refusal("no")
+    assert (tmp_path / "config.yaml").read_text() == "seed: 1\n"
 
 
 def test_a_damaged_record_does_not_end_a_run(scenes, folder, caplog):

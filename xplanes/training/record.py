@@ -19,12 +19,16 @@ from xplanes import __version__
 from xplanes.errors import ConfigError, SceneError
 from xplanes.files import read_json, replacing, write_json, write_text
 from xplanes.lrm import LRMError
+from xplanes.optional import MissingExtraError
 from xplanes.process import resume_command
 from xplanes.scenes.views import Views
 from xplanes.settings import flatten
 from xplanes.training.checkpoints import LAST, has_checkpoint, load_checkpoint
 
 logger = logging.getLogger(__name__)
+
+REFUSALS = (ConfigError, SceneError, LRMError, MissingExtraError)
+"""Errors in settings, data or weights: the run cannot begin."""
 
 KEPT = """model.name lrm.name model.sampler.name data.name data.scene data.seed data.resolution
 data.views data.train_views data.train_on_video data.static data.half_side data.centre
@@ -130,12 +134,14 @@ def claim(run: Path, *, resume: bool) -> None:
             status = "damaged"
     if not resume and not has_checkpoint(run) and status != "finished":
         return  # The run ended before its first checkpoint: nothing is lost.
-    if status is not None and not resume:
+    if not resume:
         raise ConfigError(
             f"{run} holds a run already ({status}). Resume it with {resume_command(run)}, "
             "or choose another hydra.run.dir"
+            if status is not None
+            else f"{run} holds checkpoints, but no run.json. Choose another hydra.run.dir"
         )
-    if status is None and resume:
+    if status is None:
         raise ConfigError(
             f"resume={run}: there is no run.json, hence no run to resume; start one with "
             f"hydra.run.dir={run} instead of resume"
@@ -237,7 +243,7 @@ def keeping_settings(run: Path, config: Mapping[str, Any], overrides: list[str])
     write_text(paths[1], "".join(f"{line}\n" for line in overrides))
     try:
         yield
-    except (ConfigError, SceneError, LRMError):
+    except REFUSALS:
         for path, content in before.items():
             with replacing(path) as temporary:
                 temporary.write_bytes(content)

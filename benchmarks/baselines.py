@@ -26,6 +26,9 @@ KPLANES = (
 
 TINEUVOX = ("model=tineuvox_s", "model.rays.per_batch=1024")
 
+FAR = {"fly on a ball": ("model.sampler.near=112", "model.sampler.far=122")}
+"""Distances for TiNeuVox in scenes whose cameras are not about 4 world units away."""
+
 OWN = ("lrm=none",)
 GAUSSIANS = ("model=gaussians_hexplane", "lrm=none")
 HELD_OUT = ("data=dnerf", "data.root={held_out}", "data.scene=lego")
@@ -134,7 +137,7 @@ def scenes() -> list[Case]:
         found.append(replace(case, quick="topology" in scene))
         others = {} if scene in DISTORTED else {"4D-GS": GAUSSIANS}
         if "suite" not in given[0]:
-            others |= {"K-Planes, smaller": KPLANES, "TiNeuVox-S": TINEUVOX}
+            others |= {"K-Planes, smaller": KPLANES, "TiNeuVox-S": TINEUVOX + FAR.get(scene, ())}
         for method, options in others.items():
             about = {"scene": scene, "method": method}
             found.append(Case(f"{scene}, {method}", (*given, *options, *ends), 1, about=about))

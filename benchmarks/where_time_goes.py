@@ -33,7 +33,7 @@ STAGES = (
     ("preparation: weights", "xplanes.preparation.sources", "PublishedLRMSettings.load"),
     ("building the model", "xplanes.training.module", "RadianceModule.build"),
     ("compiled loops and first call", "xplanes.rendering.grid_renderer", "render_one_ray"),
-    ("compiled loops and first call", "xplanes.training.fit", "warm_up_loops"),
+    ("compiled loops and first call", "xplanes.run", "warm_up_loops"),
     ("drawing rays", "xplanes.scenes.batches", "RayBatches.draw"),
     ("marching", "xplanes.rendering.grid_renderer", "march"),
     ("lookup", "xplanes.fields.lookup_numba", "gather"),

@@ -195,11 +195,11 @@ def train(
     loaded -= found.seconds["fill"]  # Counted as preparation.
 
     # Training
+    warm_up_loops(module, data, device)
     if record is not None:
         hardware = torch.cuda.get_device_name() if device.type == "cuda" else "cpu"
         files = {name: list(views.files) for name, views in scene.splits.items()}
         record.note(device=hardware, precision=module.field.precision, files=files)
-        warm_up_loops(module, data, device)
         expected = estimate(module, data)
         text = header(experiment, folder, data, module, overrides, expected, record.seconds)
         logger.info("\n%s", text)

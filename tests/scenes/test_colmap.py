@@ -287,6 +287,9 @@ def test_the_largest_of_several_models_is_read(capture, caplog, text):
     write_colmap(capture.path / "sparse/0", CAMERA, images[:3])
     assert len(capture.views()) == 8
     assert "sparse/1 is read, which has the most images (0 has 3, 1 has 8)" in caplog.text
+    for path in (capture.path / "sparse/1").glob("images.*"):
+        path.write_bytes(b"7 damaged")
+    assert len(capture.views()) == 3
 
 
 def test_missing_and_unregistered_images(capture, caplog):

@@ -90,7 +90,7 @@ class OccupancyGrid(nn.Module):
         self.density.mul_(self.likely)
         torch.gt(self.density, self.empty_density, out=self.occupied)
 
-    def occupied_cells(self) -> Tensor:
+    def _occupied_cells(self) -> Tensor:
         """Indices of all occupied cells, ascending. int64 [N]"""
         if self.occupied.device.type == "cpu":
             # Up to ten times as fast as PyTorch's ``nonzero``.
@@ -148,7 +148,7 @@ class OccupancyGrid(nn.Module):
         """
         device = self.density.device
         chunk = chunk or (2**15 if device.type == "cpu" else 2**19)
-        cells = self.occupied_cells()
+        cells = self._occupied_cells()
         seen = torch.zeros_like(self.density)
         for part in cells.split(chunk):
             uniform = torch.rand(len(part), 4, generator=generator).to(device)
@@ -226,7 +226,7 @@ class OccupancyGrid(nn.Module):
             [N, 3], [N]
         """
         if uniform.device.type == "cpu":
-            cells = self.occupied_cells()
+            cells = self._occupied_cells()
             if len(cells):
                 cells = cells[(uniform[:, 0] * len(cells)).long().clamp_(max=len(cells) - 1)]
             return self.draw(cells, uniform[: len(cells), 1:])
@@ -238,7 +238,7 @@ class OccupancyGrid(nn.Module):
     def _near_occupied(self, count: int, generator: torch.Generator) -> Tensor:
         """Random cells at most one cell from an occupied one along each axis, in its time bin."""
         device = self.density.device
-        cells = self.occupied_cells()
+        cells = self._occupied_cells()
         if not len(cells):
             return cells
         cells = cells[torch.randint(len(cells), (count,), generator=generator).to(device)]

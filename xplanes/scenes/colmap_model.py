@@ -9,7 +9,7 @@ import os
 import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -111,16 +111,15 @@ def models_inside(folder: Path) -> list[Path]:
 
 
 def image_count(folder: Path) -> int:
-    """Number of images in the sparse model in ``folder``.
-
-    Raises:
-        SceneError: If its list of images is damaged.
-    """
-    path = _part(folder, "images")
-    if path.suffix != ".bin":
-        return sum(1 for _ in _images(path))
-    with _binary(path) as file:
-        return file.take(COUNT, "the number of images")[0]
+    """Number of images in the sparse model in ``folder``; 0 if its list of images is damaged."""
+    with suppress(SceneError):
+        path = _part(folder, "images")
+        if path.suffix != ".bin":
+            return sum(1 for _ in _images(path))
+        with _binary(path) as file:
+            (count,) = file.take(COUNT, "the number of images")
+            return min(count, file.length // IMAGE.size)  # A damaged file may state any number.
+    return 0
 
 
 def read_model(folder: Path) -> SparseModel:

@@ -128,7 +128,6 @@ class Trainer(lightning.Trainer):
             TrainingError: If losses, gradients or parameters are no longer finite.
         """
         device = self.strategy.root_device
-        warm_up_loops(module, data, device)
         with self.interrupt.exits():
             try:
                 self.fit(module, data, ckpt_path=None if checkpoint is None else str(checkpoint))
@@ -206,6 +205,7 @@ def fit_quietly(
         limit_val_batches=0,
     )
     data = SceneDataModule.of(scene, seed=module.method.seed)
+    warm_up_loops(module, data, device)
     trainer.train(module, data, find_resumable(folder / "checkpoints"))
 
 

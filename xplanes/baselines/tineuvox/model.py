@@ -275,13 +275,13 @@ class MaskedAdam(torch.optim.Optimizer):
             return
         if parameter.device.type != "cpu":
             # ``nonzero`` would synchronise with the GPU.
-            still = gradient == 0
-            new_mean = torch.where(still, mean, mean.lerp(gradient, 1 - first))
+            unreached = gradient == 0
+            new_mean = torch.where(unreached, mean, mean.lerp(gradient, 1 - first))
             new_square = (square * second).addcmul_(gradient, gradient, value=1 - second)
             mean.copy_(new_mean)
-            square.copy_(torch.where(still, square, new_square))
+            square.copy_(torch.where(unreached, square, new_square))
             change = mean / square.sqrt().add_(group["eps"])
-            parameter.sub_(change.masked_fill_(still, 0), alpha=size * group["lr"])
+            parameter.sub_(change.masked_fill_(unreached, 0), alpha=size * group["lr"])
             return
         reached = gradient.flatten().nonzero()[:, 0]
         flat = gradient.flatten()[reached]

@@ -3,6 +3,7 @@
 import functools
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -124,11 +125,16 @@ def test_time_planes_wait_as_long_as_light_that_passes_the_cube_costs():
     assert priceless.rate_of("time", 150, 0.1) == priceless.rate_of("space", 150, 0.1)
 
 
-def test_few_views_are_scored_before_surroundings_and_none_soon_after_the_first_step():
+def test_large_views_are_few_and_surroundings_wait_after_the_first_step():
     at = [0.0, 0.05, 0.1, 0.7]
-    assert affordable(at, 1.0, surrounded=True) == ([0.0, 0.1, 0.7], 2)
-    for limit, surrounded in ((1.0, False), (7, True), (1, True), (0.5, True)):
-        assert affordable(at, limit, surrounded) == (at, limit)
+    views = scene("white").splits["train"]
+    many = 400_000 // (views.height * views.width)
+    assert affordable(at, 1.0, views, surrounded=True) == ([0.0, 0.1, 0.7], many)
+    assert affordable(at, 1.0, views, surrounded=False) == (at, many)
+    large = SimpleNamespace(height=400, width=500)
+    assert affordable(at, 1.0, large, surrounded=False) == (at, 2)  # pyright: ignore
+    for limit in (7, 1, 0.5):
+        assert affordable(at, limit, views, surrounded=True) == (at, limit)
 
 
 @pytest.mark.parametrize(("kind", "pruned"), [("world", 40), ("white", 20)])

@@ -13,6 +13,8 @@ from torch import Tensor
 from xplanes.errors import ConfigError
 from xplanes.files import write_rows
 from xplanes.rendering.pictures import plane_sheet, strip, write_png
+from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.views import Views
 from xplanes.training.clock import off_clock, training_seconds
 from xplanes.training.logs import forget_later
 from xplanes.training.module import RadianceModule
@@ -21,29 +23,35 @@ from xplanes.training.scores import mean
 SHOWN = 4
 """Number of views whose images are logged at each evaluation."""
 
-FEW_VIEWS, FIRST_SHARE = 2, 0.1
-"""Defaults in scenes with surroundings: number of views, and least share of the budget above 0."""
+ROW, LEAST_VIEWS = 400_000, 2
+"""Pixels that a row of the curve scores by default, in at least so many views."""
+
+FIRST_SHARE = 0.1
+"""Default in scenes with surroundings: least share of the budget above 0."""
 
 CURVE = ("seconds", "step", "split", "psnr", "ssim")
 """Columns of curve.csv."""
 
 
 def affordable(
-    at: Sequence[float], limit: float, surrounded: bool
+    at: Sequence[float], limit: float, views: Views, surrounded: bool
 ) -> tuple[list[float], int | float]:
     """Shares of the budget at which to evaluate, and limit on the number of views.
 
-    In scenes with surroundings the whole cube may be occupied at first, and a view takes seconds to
-    render. By default fewer views are scored, and none between step 0 and `FIRST_SHARE`.
+    Before empty space is pruned, a large view takes seconds to render: by default a row of the
+    curve scores few of them. In scenes with surroundings the whole cube may be occupied until
+    then, and no row is scored between step 0 and `FIRST_SHARE`.
 
     Args:
         at: Shares of the budget at which to evaluate.
-        limit: ``trainer.limit_val_batches``; 1.0 for all views.
+        limit: ``trainer.limit_val_batches``; 1.0 for the default.
+        views: Validation views.
         surrounded: Whether the scene has surroundings.
     """
-    if not surrounded or limit != 1.0 or isinstance(limit, int):
+    if limit != 1.0 or isinstance(limit, int):
         return list(at), limit
-    return [share for share in at if share == 0 or share >= FIRST_SHARE], FEW_VIEWS
+    shares = [share for share in at if share == 0 or share >= FIRST_SHARE or not surrounded]
+    return shares, max(LEAST_VIEWS, ROW // (views.height * views.width))
 
 
 class Evaluation(Callback):
@@ -76,9 +84,11 @@ class Evaluation(Callback):
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         if stage == "fit":
             data: Any = getattr(trainer, "datamodule", None)
-            scene, limit = getattr(data, "scene", None), trainer.limit_val_batches
-            surrounded = scene is not None and scene.is_surrounded
-            self.at, trainer.limit_val_batches = affordable(self.at, limit, surrounded)
+            if isinstance(data, SceneDataModule):
+                views = data.read_split(data.validation_split or data.test_split)
+                self.at, trainer.limit_val_batches = affordable(
+                    self.at, trainer.limit_val_batches, views, data.scene.is_surrounded
+                )
             trainer.check_val_every_n_epoch = None
             trainer.num_sanity_val_steps = float("inf") if 0 in self.at else 0
 

@@ -50,7 +50,7 @@ from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.files import read_json, require_writable, write_json, write_rows, write_text
 from xplanes.lrm.bundled import load_bundled
 from xplanes.rendering.compositing import composite_gpu, composite_reference
-from xplanes.rendering.marching import Samples, march_gpu, march_into
+from xplanes.rendering.marching import Rays, Samples, march_gpu, march_into
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.batches import DeviceBatches
 
@@ -391,10 +391,10 @@ def marching_case(rays: int, device: torch.device) -> tuple[Callable[[], Samples
     directions = functional.normalize(torch.rand(rays, 3, device=device) - 0.5 - origins, dim=1)
     times, jitter = torch.rand(2, rays, device=device)
     options = {"step": STEP, "occupied": grid.occupied, "limit": 7.0}
-    given = (origins, directions, times, jitter, grid)
+    given = Rays(origins, directions, times, jitter)
 
     def call(function: Callable[..., Samples]) -> Callable[[], Samples]:
-        return lambda: function(*given, room=PLACES * rays, **options)
+        return lambda: function(given, grid, room=PLACES * rays, **options)
 
     return call(march_gpu), call(march_into)
 
@@ -682,14 +682,14 @@ PARTS = (
     training("random, GPU", NONE, "gpu", rays_of_the_cpu=True),
     training("random, CPU", NONE, "cpu", needs_gpu=False, need=60, limit=120),
     throughput("six planes", NONE),
-    throughput("six planes, small batches", *SMALL, NONE),
-    throughput("nine planes", NINE, NONE),
-    throughput("nine planes, small batches", *SMALL, NINE, NONE),
     Part("lego", "six planes", overrides=LEGO, need=110, limit=180),
     Part("step", "six planes", measure_step, needs_gpu=False, overrides=(NONE,)),
     Part("preparation", "LRM and decomposition", measure_preparation, needs_gpu=False),
     training("tiny, GPU", TINY, "gpu", rays_of_the_cpu=True),
     training("tiny, CPU", TINY, "cpu", need=60, limit=120),
+    throughput("six planes, small batches", *SMALL, NONE),
+    throughput("nine planes", NINE, NONE),
+    throughput("nine planes, small batches", *SMALL, NINE, NONE),
     training("random, GPU, rays drawn there", NONE, "gpu"),
     throughput("six planes, torch", NONE, environment=NO_KERNELS),
     training("random, GPU, bfloat16 decoder", NONE, "gpu", "bf16"),

@@ -149,6 +149,15 @@ def test_errors_of_kernels_are_seen(gpu, tmp_path):
     assert gpu.Record.load(record.path) == record
 
 
+def test_marching_agrees_with_its_twin(gpu, tmp_path):
+    pytest.importorskip("triton")
+    record = gpu.Record(tmp_path / "record.json")
+    (part,) = (part for part in gpu.PARTS if part.row == "marching")
+    part.work(record, part, None)
+    assert not record.error
+    assert [figure.table for figure in record.figures] == ["accuracy"]
+
+
 def test_a_process_that_ends_early_leaves_one_line(gpu, monkeypatch, tmp_path, capsys):
     part = gpu.PARTS[0]
     args = SimpleNamespace(work=tmp_path, lego=Path("lego"))

@@ -94,7 +94,8 @@ def depth_before(optical_depth: Tensor, ray: Tensor, starts: Tensor) -> Tensor:
     """
     depth = optical_depth.double()
     total = depth.cumsum(0) - depth
-    return total - total[starts[ray]]
+    # Not by indexing, whose backward sorts the indices on a GPU: 3 ms for a batch.
+    return total - total.index_select(0, starts[ray])
 
 
 def distortion(

@@ -89,4 +89,5 @@ class Exposures(nn.Module):
 
     def forward(self, view: Tensor) -> Tensor:
         """Gains of rays by their training views. int64 [R] -> [R, 3]"""
-        return self.relative[self.index[view]].exp()
+        # Not by indexing, see `depth_before`.
+        return self.relative.index_select(0, self.index[view]).exp()

@@ -88,7 +88,7 @@ def cast_rays(
     if lenses is not None:
         x, y = image_plane(rows, columns, focal=focal, centre=centre, lenses=lenses)
         local = lenses.directions(x, y)[0]
-        directions = (rotation.double() @ local[..., None])[..., 0].to(rows.dtype)
+        directions = turned(local, rotation.double()).to(rows.dtype)
         return camera_to_world[..., :3, 3].expand_as(directions), directions
     middle = columns + 0.5
     focal_x, focal_y = _pair(focal)

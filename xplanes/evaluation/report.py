@@ -127,6 +127,8 @@ def summary(
     clock = training_seconds(trainer)
     counts = module.tally.counts
     candidates = max(1, counts["candidates"])
+    # Not the module's, which Lightning moves back to the CPU at the end.
+    device = trainer.strategy.root_device
     tested, blank = data.scene.splits[data.test_split], data.scene.background
     if data.scene.is_surrounded:
         blank = mean_colour(tested, blank)  # A learnt background has no constant colour.
@@ -150,9 +152,9 @@ def summary(
         "steps_skipped": module.tally.skipped,
         "restarts": module.restarts,
         "threads": torch.get_num_threads(),
-        "loops": backend.name(module.device),
+        "loops": backend.name(device),
         "parameters": sum(p.numel() for p in module.parameters()),
-        "peak_memory_bytes": device_memory(module.device),
+        "peak_memory_bytes": device_memory(device),
     }
 
 

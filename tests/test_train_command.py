@@ -210,8 +210,8 @@ def test_run_directories_have_names_that_need_no_quotes(scene, name):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         overrides = [f"data.scene={quoted(scene)}", "hydra.job.num=3"]
         config = compose("train", overrides, return_hydra_config=True)
-    assert config.hydra.run.dir.endswith(f"demo-{name}_six_planes_tiny_s0")
-    assert config.hydra.sweep.subdir == f"3_{name}_six_planes_tiny_s0"
+    assert config.hydra.run.dir.endswith(f"demo-{name}_six_planes_auto_s0")
+    assert config.hydra.sweep.subdir == f"3_{name}_six_planes_auto_s0"
 
 
 def test_names_of_scenes_may_look_like_numbers():

@@ -97,7 +97,7 @@ def test_a_model_brings_its_initialisation_and_changes_no_other_group():
         chosen = [node for node in yaml.safe_load(path.read_text())["defaults"] if node != "_self_"]
         groups = {name for node in chosen if isinstance(node, dict) for name in node}
         assert groups <= {"sampler", "override sampler", "/lrm@_global_.lrm"}, path.name
-        own = "tiny" if path.stem in ("six_planes", "nine_planes") else "none"
+        own = "auto" if path.stem in ("six_planes", "nine_planes") else "none"
         assert composed(f"model={path.stem}")["lrm"]["name"] == own, path.name
     for model in ("nine_planes", "kplanes"):
         assert composed("lrm=mini", f"model={model}")["lrm"]["name"] == "mini", model

@@ -187,6 +187,10 @@ def test_the_model_card_has_scores_command_and_licence(trained_run, tmp_path):
     config["lrm"] = {"name": "tiny", "bundled": "tiny"}
     (run / "config.yaml").write_text(yaml.safe_dump(config))
     assert "bundled with X-Planes (MIT licence)" in card_of(run)[1]
+    config["lrm"]["name"] = "auto"
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    assert metrics["lrm"] == {}
+    assert "random initialisation" in card_of(run)[1]
 
 
 def test_commands_read_a_run_of_the_hub(hub, trained_run, tmp_path, monkeypatch, capsys):

@@ -1,13 +1,20 @@
 """Runs initialised from the bundled model, the default of `python train.py`."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
+from tests.balls import ball_scene
 from tests.training.runs import composed, metrics, small_config
+from xplanes.config import compose_plain
 from xplanes.files import read_rows
 from xplanes.lrm.bundled import bundled_models
+from xplanes.models.initialisation import Initialisation, Method, Place
+from xplanes.preparation.sources import LRMInitialiser
 from xplanes.run import run
+from xplanes.scenes.frame import scene_frame
 from xplanes.tools.runs import load_run
 
 SETTINGS = (
@@ -38,10 +45,37 @@ def random(train, tmp_path_factory: pytest.TempPathFactory) -> list[float]:
 
 
 def test_the_default_initialisation_is_a_bundled_model():
-    assert composed().lrm.name in bundled_models()
+    assert composed().lrm.name == "auto"
+    assert composed().lrm.bundled in bundled_models()
 
 
-@pytest.mark.parametrize("name", ["tiny", pytest.param("mini", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("overrides", "masked", "used"),
+    [
+        ((), False, False),
+        ((), True, True),
+        (("preparation.fixed_view=train",), False, True),
+        (("lrm=tiny",), False, True),
+    ],
+)
+def test_without_a_video_only_an_lrm_that_is_asked_for_sees_a_scene(
+    monkeypatch, overrides, masked, used
+):
+    found = Initialisation(None, None, description="a video was rendered")
+    monkeypatch.setattr(LRMInitialiser, "initialise", lambda *_: found)
+    scene = ball_scene()
+    if masked:
+        scene = replace(scene, lrm_views=scene.splits["train"])
+    place = Place(scene, scene_frame(scene.splits["train"]), torch.device("cpu"))
+    method = Method.read(compose_plain("train", overrides))
+    initial = method.lrm.load().initialise(method, place)
+    assert (initial is found) == used
+    if not used:
+        assert initial.values is None
+        assert "no video of a fixed camera" in initial.description
+
+
+@pytest.mark.parametrize("name", ["auto", pytest.param("mini", marks=pytest.mark.slow)])
 def test_it_knows_the_scene_before_the_first_step(train, random, tmp_path, name):
     informed = train(tmp_path / "run", f"lrm={name}")
     assert informed[0] > random[0] + 3

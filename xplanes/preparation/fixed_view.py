@@ -22,7 +22,7 @@ from xplanes.preparation.cache import StageCache
 from xplanes.rendering.base import RayRenderer
 from xplanes.scenes.cameras import PosedCamera, camera_around
 from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame, frame_content
-from xplanes.scenes.views import Intrinsics, Views
+from xplanes.scenes.views import Intrinsics, Scene, Views
 from xplanes.training.fit import fit_quietly
 from xplanes.training.module import RadianceModule
 
@@ -97,13 +97,9 @@ def fixed_view(
         )
     times = scene.splits["train"].times
     count = 1 if scene.splits["train"].is_static else options.frames or len(times.unique())
-    # A video without alpha shows surroundings, which an LRM would treat as part of the object.
-    whole = scene.video is not None and scene.is_surrounded and scene.video.is_opaque
-    if scene.video is not None and (
-        options.fixed_view == "video" or (options.fixed_view == "auto" and not whole)
-    ):
-        check_camera(scene.video)
-        views = pick_frames(scene.video, torch.linspace(0, 1, count) if count > 1 else times[:1])
+    if (video := given_video(scene, options.fixed_view)) is not None:
+        check_camera(video)
+        views = pick_frames(video, torch.linspace(0, 1, count) if count > 1 else times[:1])
         return FixedView(views, frame.centre, 0.0, f"{len(views)} frames of the scene's video")
     if scene.lrm_views is not None:
         place = replace(
@@ -116,6 +112,20 @@ def fixed_view(
             "(data.mask_use=lrm)"
         )
     return _rendered(method, place, view, size, count, cache)
+
+
+def given_video(scene: Scene, fixed_view: str) -> Views | None:
+    """The scene's own video of a fixed camera; None if an LRM needs another one.
+
+    Args:
+        scene: The scene.
+        fixed_view: The setting `PreparationSettings.fixed_view`.
+    """
+    if scene.video is None or fixed_view == "train":
+        return None
+    # A video without alpha shows surroundings, which an LRM would treat as part of the object.
+    whole = scene.is_surrounded and scene.video.is_opaque
+    return None if whole and fixed_view == "auto" else scene.video
 
 
 def check_camera(video: Views) -> None:

@@ -22,6 +22,7 @@ from xplanes.models.initialisation import (
 )
 from xplanes.models.x_planes import XPlanesSettings
 from xplanes.preparation.cache import Stage, StageCache
+from xplanes.preparation.fixed_view import given_video
 from xplanes.preparation.reconstruct import ImageLRMSettings, LoadedLRM, loaded, reconstruct
 from xplanes.preparation.sequence import TriplaneSequence, load_triplanes
 from xplanes.preparation.stages import (
@@ -58,6 +59,14 @@ class BundledLRMSettings(ImageLRMSettings):
 
     def load(self, say: Callable[[str], None] = print) -> "LRMInitialiser":
         return LRMInitialiser(self, self.load_model(say))
+
+
+@dataclass(frozen=True, kw_only=True)
+class AutoLRMSettings(BundledLRMSettings):
+    """A bundled LRM for scenes with a video of a fixed camera, random initialisation for others."""
+
+    def load(self, say: Callable[[str], None] = print) -> "AutoInitialiser":
+        return AutoInitialiser(self, self.load_model(say))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +107,20 @@ class LRMInitialiser(Initialiser):
             lrm=made.report,
             skipped=found.skipped | {"frames": repeated},
         )
+
+
+class AutoInitialiser(LRMInitialiser):
+    """Triplanes of an LRM, or a random initialisation where a video would have to be rendered.
+
+    A field that renders one takes seconds, and the LRM then gains nothing: docs/decisions.md.
+    """
+
+    def initialise(self, method: Method, place: Place) -> Initialisation:
+        scene, wanted = place.scene, method.preparation.fixed_view
+        if wanted == "auto" and scene.lrm_views is None and given_video(scene, wanted) is None:
+            words = "random initialisation: no video of a fixed camera for an LRM"
+            return Initialisation(method.model, place.frame, description=words)
+        return super().initialise(method, place)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -188,7 +188,7 @@ A dynamic radiance field of the scene {scene}, model {model["name"]}, trained wi
 {picture}| metric ({metrics["split"]} split) | value |
 |---|---|
 {table}
-{_weights(lrm)}
+{_weights(lrm, used=bool(metrics["lrm"]))}
 
 Trained for {metrics["step"]:,} steps with
 
@@ -206,19 +206,19 @@ These commands read the scene, which is not part of this repository: it must be 
 """
 
 
-def _weights(lrm: dict[str, Any]) -> str:
-    """The card's sentence on the initial weights and their licence."""
+def _weights(lrm: dict[str, Any], *, used: bool) -> str:
+    """The card's sentence on the initial weights and their licence; ``used``: an LRM saw images."""
     name = lrm["name"]
-    if name == "none":
+    if name == "none" or (name == "auto" and not used):
         return "Training began with random initialisation: the field has no third-party weights."
     if (licence := lrm.get("licence")) is not None:
         return (
             f"Training began with the LRM `{name}` ({lrm['repository']}), whose weights have the "
             f"licence {licence}. The field contains the LRM's decoder."
         )
-    if lrm.get("bundled"):
+    if (bundled := lrm.get("bundled")) is not None:
         return (
-            f"Training began with the LRM `{name}`, bundled with X-Planes (MIT licence). The field "
-            "contains the LRM's decoder."
+            f"Training began with the LRM `{bundled}`, bundled with X-Planes (MIT licence). The "
+            "field contains the LRM's decoder."
         )
     return f"Training began with `lrm={name}`, whose files have the licence of their author."

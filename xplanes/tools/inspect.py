@@ -423,13 +423,8 @@ def _split_rows(each: Mapping[str, Any]) -> dict[str, str]:
 
 
 def next_command(capture: Capture) -> str:
-    """The command that trains on the capture, at the format's default width if images are wider.
-
-    It uses no LRM if images show surroundings, because LRMs reconstruct single objects.
-    """
+    """The command that trains on the capture, at the format's default width if images are wider."""
     overrides = [*capture.choice.overrides]
-    if capture.scene.is_surrounded and not any(text.startswith("lrm=") for text in overrides):
-        overrides.append("lrm=none")
     if width := _width_of_training(capture.choice, capture.scene):
         overrides = [f"data.resolution={width}" if text == NATIVE else text for text in overrides]
     return f"{train_command()} {shlex.join(overrides)}"

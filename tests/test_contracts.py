@@ -86,7 +86,7 @@ COMPOSITIONS = [
     ["data=colmap", "model=tensor4d_density"],
     ["data=nerfies", "model=kplanes_explicit"],
     ["data=llff", "model=kplanes_explicit"],
-    ["recipe=paper", "preparation=paper"],
+    ["recipe=paper", "preparation=paper", "lrm=auto"],
     ["recipe=paper_small", "sweep=rank", "experiment=demo"],
     ["recipe=fair"],
     ["model=kplanes_reduced", "experiment=published"],

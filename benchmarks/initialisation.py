@@ -2,13 +2,14 @@
 
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
 
 import controls
-from baselines import HELD_OUT, hold_out
-from figures import dots, legend, panels, save
+from baselines import GAUSSIANS, HELD_OUT, KPLANES, TINEUVOX, hold_out
+from figures import curves, dots, legend, panels, save
 from runner import markdown
 from sections import DATA, WORK, Case, Row, Section, number, trainings, value
 
@@ -180,7 +181,56 @@ def show_lead(rows: list[Row]) -> str:
     return markdown((*columns, "lead, dB", "preparation, s"), lines)
 
 
+FEWEST = (3, 5, 10)
+TESTED = {**{name: scene_of(name) for name in ("walker", "windmill")}, "lego": scene_of("lego")}
+METHODS = {
+    "six planes, tiny": ("lrm=tiny",),
+    "six planes, random": ("lrm=none",),
+    "4D-GS": GAUSSIANS,
+    "K-Planes, smaller": KPLANES,
+    "TiNeuVox-S": TINEUVOX,
+}
+
+
+def few_cases() -> list[Case]:
+    found = []
+    for (scene, given), views, (method, own) in product(TESTED.items(), FEWEST, METHODS.items()):
+        about = {"scene": scene, "views": views, "method": method}
+        name = f"{scene}, {views} views, {method}"
+        overrides = (*given, f"data.views={views}", *within(30), "trainer.limit_val_batches=1")
+        found.append(Case(name, (*overrides, *own), about=about))
+    return found
+
+
+def show_few(rows: list[Row]) -> str:
+    known = {(row["scene"], row["method"], row["views"]): row for row in rows}
+    figure, places = panels(len(TESTED), 2.1 * len(TESTED), sharex=True)
+    for axes, scene in zip(places, TESTED, strict=True):
+        lines = {
+            name: [
+                (views, *found)
+                for views in FEWEST
+                if (found := value(known.get((scene, name, views)), "psnr")) is not None
+            ]
+            for name in METHODS
+        }
+        curves(axes, {name: line for name, line in lines.items() if line})
+        axes.set(title=scene, ylabel="PSNR, dB", xticks=FEWEST)
+    places[-1].set_xlabel("training views")
+    save(figure, "few_views")
+    ours = ("six planes, tiny", "six planes, random")
+    body = []
+    for scene, views in product(TESTED, FEWEST):
+        own = {name: known.get((scene, name, views), {}) for name in METHODS}
+        tiny, random = (own[name].get("psnr") for name in ours)
+        lead = "" if tiny is None or random is None else f"{tiny - random:+.2f}"
+        body.append((scene, views, *(number(row, "psnr") for row in own.values()), lead))
+    columns = ("scene", "views", *(f"{name}, dB" for name in METHODS), "`tiny` leads by, dB")
+    return f"![PSNR against the number of views](few_views.png)\n\n{markdown(columns, body)}"
+
+
 SECTIONS: tuple[Section, ...] = (
     trainings(cases(), before=before, name="controls", show=show),
+    trainings(few_cases(), before=before, name="few_views", show=show_few),
     trainings(lead_cases(), before=before, name="lead", show=show_lead),
 )

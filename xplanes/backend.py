@@ -134,6 +134,11 @@ def gpu_kernels(tensor: Tensor) -> bool:
     )
 
 
+def in_group() -> bool:
+    """Whether this process trains together with others, so that they must agree."""
+    return torch.distributed.is_available() and torch.distributed.is_initialized()
+
+
 def waves(device: torch.device, *shape: int) -> Tensor:
     """Test input from -1 to 1, made without any random generator."""
     count = torch.arange(torch.Size(shape).numel(), device=device, dtype=torch.float32)

@@ -11,7 +11,7 @@ import yaml
 
 from xplanes.baselines.kplanes.field import contract_cube
 from xplanes.config import CONF
-from xplanes.fields.background import FARTHEST, Background, contract, expand
+from xplanes.fields.background import Background, contract
 from xplanes.models.background import BackgroundSettings, weighted_median
 from xplanes.rendering.behind import background_colour, behind
 from xplanes.streams import Stream, TrainingState, initial_values
@@ -66,16 +66,6 @@ def test_contraction_to_a_cube_is_the_formula_and_keeps_the_unit_cube():
     inside = points.abs().amax(dim=1) < 0.999
     assert inside.sum() > 50
     assert torch.equal(found[inside], points[inside])
-
-
-def test_expansion_undoes_the_contraction():
-    generator = torch.Generator().manual_seed(1)
-    points = torch.randn(400, 3, generator=generator, dtype=torch.float64) * 100 ** (
-        torch.rand(400, 1, generator=generator, dtype=torch.float64)
-    )
-    torch.testing.assert_close(expand(contract(points)), points, rtol=1e-9, atol=1e-12)
-    edge = expand(torch.tensor([[2.0, 0.0, 0.0], [0.0, -3.0, 0.0]]))
-    assert edge.tolist() == [[pytest.approx(FARTHEST), 0, 0], [0, pytest.approx(-FARTHEST), 0]]
 
 
 def exit_of(origin, direction):

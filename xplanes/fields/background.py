@@ -9,9 +9,6 @@ from xplanes.fields.lookup import plane_features
 RADIUS = 2.0
 """Radius of the ball into which `contract` maps all of space."""
 
-FARTHEST = 1e30
-"""Distance assigned to points on the ball's surface, which are infinitely far."""
-
 INITIAL_SCALE = 1e-3
 """Standard deviation of the planes' random initial values."""
 
@@ -42,22 +39,6 @@ def contract(points: Tensor) -> Tensor:
     outside = largest * length > 1
     unit = share / torch.where(outside, length, 1)
     return torch.where(outside, (RADIUS - 1 / length / largest) * unit, points)
-
-
-def expand(points: Tensor) -> Tensor:
-    """The inverse of `contract`.
-
-    Args:
-        points: Positions in the ball of radius 2; those on its surface or outside are placed at
-            distance `FARTHEST`. [..., 3]
-
-    Returns:
-        [..., 3]
-    """
-    length = points.norm(dim=-1, keepdim=True)
-    outside = length > 1
-    unit = points / torch.where(outside, length, 1)
-    return torch.where(outside, unit / (RADIUS - length).clamp_min(1 / FARTHEST), points)
 
 
 class Background(nn.Module):

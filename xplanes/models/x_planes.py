@@ -38,7 +38,7 @@ from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Group, Site, time_rows
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
-from xplanes.streams import Stream, TrainingState, step_generator
+from xplanes.streams import Stream, TrainingState, initial_values, step_generator
 
 FINE_WARMUP = 100
 """Warm-up steps of the fine planes' learning rate."""
@@ -223,8 +223,7 @@ class XPlanesSettings(ModelSettings):
             zeros = torch.zeros(self.fine.channels, texels, texels)
             planes = {**planes, **dict.fromkeys(FINE_PLANES, zeros)}
         options = self.decoder
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(generator.initial_seed())
+        with initial_values(site.seed, Stream.INITIAL_FIELD):
             decoder = Decoder(
                 self.channels,
                 width=options.width,

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, cast
 import torch
 from torch import Tensor, distributed, nn
 
-from xplanes.backend import cpu_loops, warm_up
+from xplanes.backend import cpu_loops, in_group, warm_up
 from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
@@ -409,7 +409,7 @@ class OccupancySampler(Sampler):
         for parameter, gradient in zip(parameters, gradients, strict=True):
             if gradient is None:
                 continue
-            if distributed.is_available() and distributed.is_initialized():
+            if in_group():
                 distributed.all_reduce(gradient)  # Each process has its own points.
                 gradient /= distributed.get_world_size()
             if parameter.grad is None:
@@ -454,7 +454,7 @@ class OccupancySampler(Sampler):
 
     def _agree(self) -> None:
         """Copy the first process's grid to all, since each has observed only its own samples."""
-        if distributed.is_available() and distributed.is_initialized():
+        if in_group():
             for part in (self.grid.density, self.grid.least, self.grid.occupied):
                 distributed.broadcast(part, src=0)
 

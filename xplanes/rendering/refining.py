@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, distributed, nn
 
+from xplanes.backend import in_group
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Sampler, WrappingSampler
 from xplanes.scenes.batches import Batch
@@ -188,7 +189,7 @@ class CameraCorrections(nn.Module):
     def solve(self) -> None:
         """Correct the cameras from the observations since the last correction, and clear these."""
         sums = (self.steepness, self.residual, self.pixels, self.rays)
-        if distributed.is_available() and distributed.is_initialized():
+        if in_group():
             for each in sums:  # Each process has its own rays.
                 distributed.all_reduce(each)
         count = self.rays.clamp(min=1e-9)[:, None]

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, distributed
 
+from xplanes.backend import in_group
 from xplanes.scenes.views import Views
 
 MOST_TILES = 2**17
@@ -117,7 +118,7 @@ class ErrorMap:
         fresh[1].index_add_(0, tile, torch.ones_like(error))
         self.batches += 1
         if self.batches % REFRESH == 0:
-            if distributed.is_available() and distributed.is_initialized():
+            if in_group():
                 distributed.all_reduce(fresh)
             # A batch that is not finite must not remain in the sums.
             self._sums[0].mul_(KEPT).add_(fresh).nan_to_num_(0.0, 0.0, 0.0)

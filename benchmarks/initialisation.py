@@ -8,7 +8,7 @@ from statistics import fmean
 from typing import NamedTuple
 
 import controls
-from baselines import GAUSSIANS, HELD_OUT, KPLANES, TINEUVOX, hold_out
+from baselines import GAUSSIANS, HELD_OUT, KPLANES, hold_out
 from figures import curves, dots, legend, panels, save
 from runner import markdown
 from sections import DATA, WORK, Case, Row, Section, number, trainings, value
@@ -146,41 +146,6 @@ def show(rows: list[Row]) -> str:
     )
 
 
-LEAD = {
-    **{name: (f"data.scene={name}",) for name in DEMOS},
-    "lego": HELD_OUT,
-    "half_circle_test": ("data=suite", "data.scene=half_circle_test"),
-}
-VIDEO = ("data.train_on_video=true",)
-
-
-def lead_cases() -> list[Case]:
-    found = []
-    for views, scene in [*((ALL, name) for name in LEAD), *((FEW, name) for name in DEMOS)]:
-        for video in ((), VIDEO) if scene in DEMOS else ((),):
-            for lrm in ("none", "tiny"):
-                some = () if views == ALL else (f"data.views={views}",)
-                given = (*LEAD[scene], "data.resolution=100", *some, *video, f"lrm={lrm}")
-                seen = {"scene": scene, "views": views, "video": bool(video), "lrm": lrm}
-                name = f"{scene}, {views} views{', video' if video else ''}, {lrm}"
-                found.append(Case(name, (*given, *within(20)), about=seen))
-    return found
-
-
-def show_lead(rows: list[Row]) -> str:
-    known = {(row["scene"], row["views"], row["video"], row["lrm"]): row for row in rows}
-    lines = []
-    for scene, views, video, lrm in known:
-        if lrm == "none":
-            random, tiny = (known[scene, views, video, name] for name in ("none", "tiny"))
-            ahead = f"{tiny['psnr'] - random['psnr']:+.2f}"
-            scores = (number(row, "psnr") for row in (random, tiny))
-            seen = "yes" if video else ""
-            lines.append((scene, views, seen, *scores, ahead, number(tiny, "prepare", 1)))
-    columns = ("scene", "views", "video's frames for both", "random, dB", "LRM, dB")
-    return markdown((*columns, "lead, dB", "preparation, s"), lines)
-
-
 FEWEST = (3, 5, 10)
 TESTED = {**{name: scene_of(name) for name in ("walker", "windmill")}, "lego": scene_of("lego")}
 METHODS = {
@@ -188,7 +153,7 @@ METHODS = {
     "six planes, random": ("lrm=none",),
     "4D-GS": GAUSSIANS,
     "K-Planes, smaller": KPLANES,
-    "TiNeuVox-S": TINEUVOX,
+    "TiNeuVox, reduced": ("model=tineuvox_reduced",),
 }
 
 
@@ -198,7 +163,8 @@ def few_cases() -> list[Case]:
         about = {"scene": scene, "views": views, "method": method}
         name = f"{scene}, {views} views, {method}"
         overrides = (*given, f"data.views={views}", *within(30), "trainer.limit_val_batches=1")
-        found.append(Case(name, (*overrides, *own), about=about))
+        seeds = 3 if method.startswith("six") else 1
+        found.append(Case(name, (*overrides, *own), seeds, about=about))
     return found
 
 
@@ -232,5 +198,4 @@ def show_few(rows: list[Row]) -> str:
 SECTIONS: tuple[Section, ...] = (
     trainings(cases(), before=before, name="controls", show=show),
     trainings(few_cases(), before=before, name="few_views", show=show_few),
-    trainings(lead_cases(), before=before, name="lead", show=show_lead),
 )

@@ -204,10 +204,14 @@ def test_every_option_composes_and_reads(overrides, tmp_path):
 @pytest.mark.parametrize(
     "overrides",
     [
-        *(["model=" + name] for name in ("six_planes", "kplanes_explicit", *MODELS_OF_A_KIND)),
+        ["model=six_planes"],
         ["model=nine_planes", "model/sampler=proposal"],
+        *(
+            pytest.param(["model=" + name], marks=pytest.mark.slow)
+            for name in ("kplanes_explicit", *MODELS_OF_A_KIND)
+        ),
     ],
-    ids=" ".join,
+    ids=lambda overrides: " ".join(overrides),
 )
 def test_every_class_of_models_builds_and_renders(overrides):
     module, batches = built(small(*overrides), scene_of())

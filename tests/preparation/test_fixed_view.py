@@ -242,6 +242,7 @@ def test_the_video_shows_what_the_field_holds_from_the_models_camera(tmp_path, m
     torch.testing.assert_close((middle - frame.centre).norm(), away, rtol=1e-3, atol=0)
 
 
+@pytest.mark.slow
 def test_kplanes_render(tmp_path, small_fields):
     options = ("preparation.fixed_view_model=kplanes", "preparation.fixed_view_steps=10")
     made, said = video_of(settings(tmp_path, *options), ball_scene(), tmp_path / "cache", size=12)

@@ -8,7 +8,7 @@ from xplanes.backend import njit
 from xplanes.fields.lookup_numba import COMPILE, add, time_taps
 
 
-@njit(inline="always", **COMPILE)
+@njit(forceinline=True, **COMPILE)
 def border_taps(value, size):
     return time_taps((value + type(value)(1)) * type(value)(0.5), size)
 

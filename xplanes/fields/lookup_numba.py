@@ -19,7 +19,7 @@ def tasks_a_plane(planes):
     return 1 << ((get_num_threads() - 1) // planes).bit_length()
 
 
-@njit(inline="always", **COMPILE)
+@njit(forceinline=True, **COMPILE)
 def space_taps(value, size):
     half = type(value)(0.5)
     position = value * type(value)(size) * half + (type(value)(size) * half - half)
@@ -37,7 +37,7 @@ def space_taps(value, size):
     return max(min(lower, size - 1), 0), min(lower + 1, size - 1), first, second
 
 
-@njit(inline="always", **COMPILE)
+@njit(forceinline=True, **COMPILE)
 def time_taps(value, size):
     position = value * type(value)(size - 1)
     safe = position if position > 0 else type(value)(0)
@@ -48,7 +48,7 @@ def time_taps(value, size):
     return lower, min(lower + 1, size - 1), type(value)(1) - fraction, fraction
 
 
-@njit(inline="always", **COMPILE)
+@njit(forceinline=True, **COMPILE)
 def add(target, source, weight):
     for c in range(len(target)):
         target[c] += weight * source[c]
@@ -104,32 +104,39 @@ def gather_onto(space, points, features):
                 )
 
 
-@njit(inline="always", **COMPILE)
-def add_to_space(points, gradient, plane, own, tasks, space):
-    for n in range(points.shape[0]):
-        c0, c1, u0, u1 = space_taps(points[n, 0 if plane < 2 else 1], space.shape[2])
-        r0, r1, v0, v1 = space_taps(points[n, 1 if plane < 1 else 2], space.shape[1])
-        source = gradient[n, plane]
-        if r0 & (tasks - 1) == own:
-            add(space[plane, r0, c0], source, v0 * u0)
-            add(space[plane, r0, c1], source, v0 * u1)
-        if r1 & (tasks - 1) == own:
-            add(space[plane, r1, c0], source, v1 * u0)
-            add(space[plane, r1, c1], source, v1 * u1)
-
-
-@njit(parallel=True, **COMPILE)
 def scatter_space(points, gradient, tasks, space):
     """Each task owns every n-th row of a plane, so that no two tasks write to the same texel.
 
     Each row adds the points in order, so that sums do not depend on the number of tasks.
     """
-    if tasks == 1:  # Compiled separately: a tenth faster without the test of a row's owner.
-        for plane in prange(3):
-            add_to_space(points, gradient, plane, 0, 1, space)
+    if tasks == 1:  # A tenth faster without the test of a row's owner.
+        scatter_planes(points, gradient, space)
     else:
-        for task in prange(3 * tasks):
-            add_to_space(points, gradient, task // tasks, task % tasks, tasks, space)
+        scatter_rows(points, gradient, tasks, space)
+
+
+@njit(parallel=True, **COMPILE)
+def scatter_planes(points, gradient, space):
+    for plane in prange(3):
+        for n in range(points.shape[0]):
+            c0, c1, u0, u1 = space_taps(points[n, 0 if plane < 2 else 1], space.shape[2])
+            r0, r1, v0, v1 = space_taps(points[n, 1 if plane < 1 else 2], space.shape[1])
+            for r, v in ((r0, v0), (r1, v1)):
+                for c, u in ((c0, u0), (c1, u1)):
+                    add(space[plane, r, c], gradient[n, plane], v * u)
+
+
+@njit(parallel=True, **COMPILE)
+def scatter_rows(points, gradient, tasks, space):
+    for task in prange(3 * tasks):
+        plane, own = task // tasks, task % tasks
+        for n in range(points.shape[0]):
+            c0, c1, u0, u1 = space_taps(points[n, 0 if plane < 2 else 1], space.shape[2])
+            r0, r1, v0, v1 = space_taps(points[n, 1 if plane < 1 else 2], space.shape[1])
+            for r, v in ((r0, v0), (r1, v1)):
+                if r & (tasks - 1) == own:
+                    for c, u in ((c0, u0), (c1, u1)):
+                        add(space[plane, r, c], gradient[n, plane], v * u)
 
 
 @njit(parallel=True, **COMPILE)
@@ -148,20 +155,16 @@ def scatter_time(points, times, axes, gradient, tasks, time):
     """As `scatter_space`, for time planes."""
     for task in prange(time.shape[0] * tasks):
         plane, own = task // tasks, task % tasks
-        target, axis = time[plane], axes[plane]
         for n in range(points.shape[0]):
             r0, r1, v0, v1 = time_taps(times[n], time.shape[1])
-            c0, c1, u0, u1 = space_taps(points[n, axis], time.shape[2])
-            source = gradient[n, plane]
-            if r0 & (tasks - 1) == own:
-                add(target[r0, c0], source, v0 * u0)
-                add(target[r0, c1], source, v0 * u1)
-            if r1 & (tasks - 1) == own:
-                add(target[r1, c0], source, v1 * u0)
-                add(target[r1, c1], source, v1 * u1)
+            c0, c1, u0, u1 = space_taps(points[n, axes[plane]], time.shape[2])
+            for r, v in ((r0, v0), (r1, v1)):
+                if r & (tasks - 1) == own:
+                    for c, u in ((c0, u0), (c1, u1)):
+                        add(time[plane, r, c], gradient[n, plane], v * u)
 
 
-@njit(inline="always", **COMPILE)
+@njit(forceinline=True, **COMPILE)
 def add_differences(target, values, others, factor):
     for n in range(len(target)):
         target[n] += factor * (values[n] - others[n])

@@ -16,12 +16,12 @@ EXACT = {**COMPILE, "fastmath": False}
 """Options for loops that must reproduce the same numbers: fused multiply-add rounds differently."""
 
 
-@njit(inline="always", **EXACT)
+@njit(forceinline=True, **EXACT)
 def cell(place, size):
     return min(max(np.int64(place), 0), size - 1)
 
 
-@njit(inline="always", **EXACT)
+@njit(forceinline=True, **EXACT)
 def cell_to_sample(r, distance, start, slope, bins, occupied, size, skip):
     """Index of the cell of ray r at a distance; -1 if no sample is placed there."""
     x = cell(start[r, 0] + distance * slope[r, 0], size)

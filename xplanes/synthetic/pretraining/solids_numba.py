@@ -18,7 +18,7 @@ INWARD = 0.998
 TRACE = 96
 
 
-@njit(inline="always", **COMPILE)
+@njit(forceinline=True, **COMPILE)
 def ball(ox, oy, oz, dx, dy, dz, radius):
     along = ox * dx + oy * dy + oz * dz
     fx, fy, fz = ox - along * dx, oy - along * dy, oz - along * dz
@@ -29,7 +29,7 @@ def ball(ox, oy, oz, dx, dy, dz, radius):
     return -along - reach, -along + reach
 
 
-@njit(inline="always", **COMPILE)
+@njit(forceinline=True, **COMPILE)
 def slab(origin, direction, half):
     inverse = 1 / (direction if abs(direction) > 1e-12 else 1e-12)
     reach = half * abs(inverse)
@@ -138,7 +138,7 @@ def normal(kind, a, b, c, x, y, z):
     return x / length, y / length, z / length
 
 
-@njit(inline="always", **COMPILE)
+@njit(forceinline=True, **COMPILE)
 def cell(value, width):
     return math.floor(value * (INWARD / width))
 

@@ -221,13 +221,17 @@ def fast_bf16(device: torch.device) -> bool:
     return False
 
 
-def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def njit(*, exact: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit` with an on-disk cache if numba finds a writable folder.
 
     Args:
-        options: As for `numba.njit`; ``cache`` is set here.
+        exact: Whether results must equal those of other code: no fused multiply-add, which rounds
+            differently.
+        options: As for `numba.njit`.
     """
     numba = importlib.import_module("numba")
+    fixed = {"nogil": True, "error_model": "numpy"}
+    options = fixed | {"fastmath": False if exact else {"contract"}} | options
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:
@@ -251,11 +255,6 @@ def _warn_not_cached() -> None:
 def compiled(module: str) -> Any:
     """Import numba loops, which compile on first use; the first import takes about a second."""
     _start_threads()
-    return importlib.import_module(module)
-
-
-def gpu_module(module: str) -> Any:
-    """Import a module of Triton kernels; does not load numba."""
     return importlib.import_module(module)
 
 

@@ -1,6 +1,7 @@
 """Products of feature planes at several scales, as in K-Planes, and their regularisers."""
 
 import functools
+import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -10,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from xplanes.backend import compiled, cpu_loops, gpu_kernels, gpu_module, proven, waves
+from xplanes.backend import compiled, cpu_loops, gpu_kernels, proven, waves
 from xplanes.fields.regularisers import (
     add_time_smoothness_gradient,
     add_total_variation_gradient,
@@ -183,7 +184,7 @@ class _Kernels(torch.autograd.Function):
         places = places.to(torch.promote_types(first.dtype, torch.float32)).contiguous()
         product = first.new_empty(len(places), first.shape[1])
         if len(places):
-            gpu = gpu_module("xplanes.baselines.products_triton")
+            gpu = importlib.import_module("xplanes.baselines.products_triton")
             gpu.multiply(tuple(_rows(plane) for plane in planes), places, axes, product)
         ctx.save_for_backward(places, *planes)
         ctx.axes = axes
@@ -201,7 +202,7 @@ class _Kernels(torch.autograd.Function):
             for plane in planes
         ]
         if len(places):
-            gpu_module("xplanes.baselines.products_triton").multiply_backward(
+            importlib.import_module("xplanes.baselines.products_triton").multiply_backward(
                 tuple(_rows(plane) for plane in planes),
                 places,
                 ctx.axes,

@@ -5,15 +5,15 @@
 from numba import prange
 
 from xplanes.backend import njit
-from xplanes.fields.lookup_numba import COMPILE, add, time_taps
+from xplanes.fields.lookup_numba import add, time_taps
 
 
-@njit(forceinline=True, **COMPILE)
+@njit(forceinline=True)
 def border_taps(value, size):
     return time_taps((value + type(value)(1)) * type(value)(0.5), size)
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def multiply(planes, places, axes, product):
     channels = product.shape[1]
     for n in prange(places.shape[0]):
@@ -35,7 +35,7 @@ def multiply(planes, places, axes, product):
                     product[n, c] *= value
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def multiply_backward(planes, places, axes, gradient, spread, gradients):
     """Gradients of `multiply`, in blocks whose intermediate results fit in the cache."""
     block, count, channels = spread.shape

@@ -9,6 +9,7 @@ first row (t = 0) to that of the last (t = 1): with as many rows as frames, each
 """
 
 import functools
+import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from xplanes.backend import compiled, cpu_loops, gpu_kernels, gpu_module, proven, waves
+from xplanes.backend import compiled, cpu_loops, gpu_kernels, proven, waves
 
 Rows = tuple[tuple[int, int], ...]
 """For each space plane, the two time planes whose product is added to it."""
@@ -198,7 +199,7 @@ class _Kernels(torch.autograd.Function):
         axes = () if time is None else tuple(time_plane_axes(rows))
         features = space.new_empty(len(points), 3, space.shape[3])
         if len(points):
-            gpu = gpu_module("xplanes.fields.lookup_triton")
+            gpu = importlib.import_module("xplanes.fields.lookup_triton")
             gpu.gather(space, time, points, times, rows, axes, features)
         ctx.save_for_backward(time, points, times)
         ctx.space, ctx.rows, ctx.axes = (space.shape, space.dtype), rows, axes
@@ -215,7 +216,7 @@ class _Kernels(torch.autograd.Function):
         of_space = gradient.new_zeros(shape) if ctx.needs_input_grad[0] else None
         of_time = gradient.new_zeros(time.shape) if ctx.needs_input_grad[1] else None
         if len(points):
-            gpu = gpu_module("xplanes.fields.lookup_triton")
+            gpu = importlib.import_module("xplanes.fields.lookup_triton")
             gpu.scatter(shape[1], time, points, times, rows, axes, gradient, of_space, of_time)
         of_space = None if of_space is None else of_space.to(dtype)
         of_time = None if of_time is None else of_time.to(time.dtype)

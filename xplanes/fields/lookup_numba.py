@@ -11,15 +11,13 @@ from numba import get_num_threads, prange
 
 from xplanes.backend import njit
 
-COMPILE = {"nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
-
 
 def tasks_a_plane(planes):
     """Tasks per plane, which share its rows: a power of 2 that gives every thread a task."""
     return 1 << ((get_num_threads() - 1) // planes).bit_length()
 
 
-@njit(forceinline=True, **COMPILE)
+@njit(forceinline=True)
 def space_taps(value, size):
     half = type(value)(0.5)
     position = value * type(value)(size) * half + (type(value)(size) * half - half)
@@ -37,7 +35,7 @@ def space_taps(value, size):
     return max(min(lower, size - 1), 0), min(lower + 1, size - 1), first, second
 
 
-@njit(forceinline=True, **COMPILE)
+@njit(forceinline=True)
 def time_taps(value, size):
     position = value * type(value)(size - 1)
     safe = position if position > 0 else type(value)(0)
@@ -48,13 +46,13 @@ def time_taps(value, size):
     return lower, min(lower + 1, size - 1), type(value)(1) - fraction, fraction
 
 
-@njit(forceinline=True, **COMPILE)
+@njit(forceinline=True)
 def add(target, source, weight):
     for c in range(len(target)):
         target[c] += weight * source[c]
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def gather(space, time, points, times, rows, axes, features, factors):
     channels = space.shape[3]
     for n in prange(points.shape[0]):
@@ -88,7 +86,7 @@ def gather(space, time, points, times, rows, axes, features, factors):
                 features[n, row, c] += factors[n, a, c] * factors[n, b, c]
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def gather_onto(space, points, features):
     for n in prange(points.shape[0]):
         for plane in range(3):
@@ -115,7 +113,7 @@ def scatter_space(points, gradient, tasks, space):
         scatter_rows(points, gradient, tasks, space)
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def scatter_planes(points, gradient, space):
     for plane in prange(3):
         for n in range(points.shape[0]):
@@ -126,7 +124,7 @@ def scatter_planes(points, gradient, space):
                     add(space[plane, r, c], gradient[n, plane], v * u)
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def scatter_rows(points, gradient, tasks, space):
     for task in prange(3 * tasks):
         plane, own = task // tasks, task % tasks
@@ -139,7 +137,7 @@ def scatter_rows(points, gradient, tasks, space):
                         add(space[plane, r, c], gradient[n, plane], v * u)
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def product_gradients(rows, gradient, factors, spread):
     for n in prange(gradient.shape[0]):
         spread[n] = 0
@@ -150,7 +148,7 @@ def product_gradients(rows, gradient, factors, spread):
                 spread[n, b, c] += gradient[n, row, c] * factors[n, a, c]
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def scatter_time(points, times, axes, gradient, tasks, time):
     """As `scatter_space`, for time planes."""
     for task in prange(time.shape[0] * tasks):
@@ -164,13 +162,13 @@ def scatter_time(points, times, axes, gradient, tasks, time):
                         add(time[plane, r, c], gradient[n, plane], v * u)
 
 
-@njit(forceinline=True, **COMPILE)
+@njit(forceinline=True)
 def add_differences(target, values, others, factor):
     for n in range(len(target)):
         target[n] += factor * (values[n] - others[n])
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def add_variation(planes, steps, rows, columns, gradient):
     """Add differences from neighbouring texels, times the factors ``rows`` and ``columns``.
 

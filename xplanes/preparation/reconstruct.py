@@ -23,12 +23,10 @@ from xplanes.preparation.encode import encode
 from xplanes.preparation.fixed_view import FixedView, fixed_view
 from xplanes.preparation.sequence import TriplaneSequence
 from xplanes.preparation.stages import contact_sheet
+from xplanes.scenes.matte import SOLID
 from xplanes.settings import Count, Location
 
 logger = logging.getLogger(__name__)
-
-SOLID = 128
-"""Alpha from which a pixel belongs to the object when cropping."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Volume rendering: from densities and colours along rays to pixels."""
 
 import functools
+import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -8,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from xplanes.backend import compiled, cpu_loops, gpu_kernels, gpu_module, proven, waves
+from xplanes.backend import compiled, cpu_loops, gpu_kernels, proven, waves
 
 OPAQUE = 80.0
 """Optical depth that counts as opaque: exp(-80) is 2e-35."""
@@ -181,7 +182,7 @@ class _Kernels(torch.autograd.Function):
         starts: Tensor,
         number: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        gpu = gpu_module("xplanes.rendering.compositing_triton")
+        gpu = importlib.import_module("xplanes.rendering.compositing_triton")
         if number is None:
             number = starts.new_full((), len(optical_depth))
         inputs = [t.contiguous() for t in (optical_depth, colour, distances, starts, number)]
@@ -198,7 +199,7 @@ class _Kernels(torch.autograd.Function):
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any, *gradients: Tensor
     ) -> tuple[Tensor | None, ...]:
-        gpu = gpu_module("xplanes.rendering.compositing_triton")
+        gpu = importlib.import_module("xplanes.rendering.compositing_triton")
         *inputs, weights, light = ctx.saved_tensors
         d_depth, d_colour = torch.zeros_like(inputs[0]), torch.zeros_like(inputs[1])
         gradient = gradients[0].to(weights.dtype).contiguous()

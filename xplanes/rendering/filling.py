@@ -11,10 +11,8 @@ from xplanes.rendering.box import Field
 from xplanes.rendering.marching import Rays, Samples, march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.frame import Frame
+from xplanes.scenes.matte import SOLID
 from xplanes.scenes.views import Views
-
-SOLID = 128
-"""Alpha from which a pixel counts as foreground."""
 
 RAYS = 65536
 """Rays that are marched together: all pixels of a large image would fill the memory."""

@@ -1,6 +1,7 @@
 """Placement of samples along rays in occupied cells."""
 
 import functools
+import importlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from xplanes.backend import compiled, cpu_loops, gpu_kernels, gpu_module, proven, waves
+from xplanes.backend import compiled, cpu_loops, gpu_kernels, proven, waves
 from xplanes.rendering.box import ray_box
 from xplanes.rendering.compositing import OPAQUE, depth_before
 from xplanes.rendering.occupancy import OccupancyGrid
@@ -227,7 +228,7 @@ def march_gpu(
 
     The kernel runs twice: to count the samples of each ray, and to write them.
     """
-    gpu = gpu_module("xplanes.rendering.marching_triton")
+    gpu = importlib.import_module("xplanes.rendering.marching_triton")
     origins = rays.origins
     count, device = len(origins), origins.device
     given = [tensor.contiguous() for tensor in rays]

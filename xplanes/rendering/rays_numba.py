@@ -10,18 +10,13 @@ from numba import prange
 
 from xplanes.backend import njit
 
-COMPILE = {"nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
 
-EXACT = {**COMPILE, "fastmath": False}
-"""Options for loops that must reproduce the same numbers: fused multiply-add rounds differently."""
-
-
-@njit(forceinline=True, **EXACT)
+@njit(exact=True, forceinline=True)
 def cell(place, size):
     return min(max(np.int64(place), 0), size - 1)
 
 
-@njit(forceinline=True, **EXACT)
+@njit(exact=True, forceinline=True)
 def cell_to_sample(r, distance, start, slope, bins, occupied, size, skip):
     """Index of the cell of ray r at a distance; -1 if no sample is placed there."""
     x = cell(start[r, 0] + distance * slope[r, 0], size)
@@ -33,7 +28,7 @@ def cell_to_sample(r, distance, start, slope, bins, occupied, size, skip):
     return index
 
 
-@njit(parallel=True, **EXACT)
+@njit(exact=True, parallel=True)
 def count_samples(
     start,
     slope,
@@ -66,7 +61,7 @@ def count_samples(
         counts[0, r], counts[1, r], counts[2, r] = candidates, found, visible
 
 
-@njit(parallel=True, **EXACT)
+@njit(exact=True, parallel=True)
 def fill_samples(
     origins,
     directions,
@@ -101,7 +96,7 @@ def fill_samples(
                 place += 1
 
 
-@njit(**EXACT)
+@njit(exact=True)
 def observe_cells(cells, observed, allowed, density, least, occupied, decay, trust, empty):
     """Update cells from densities: from the maximum per cell, and ``least`` from the minimum."""
     highest, lowest = np.empty_like(observed), np.empty_like(observed)
@@ -120,7 +115,7 @@ def observe_cells(cells, observed, allowed, density, least, occupied, decay, tru
         occupied[cells[n]] = density[cells[n]] > empty
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def composite(optical_depth, colour, distances, starts, opaque, weights, total):
     """Weights of the samples, and colour, opacity and depth of the rays."""
     rays = len(starts)
@@ -144,7 +139,7 @@ def composite(optical_depth, colour, distances, starts, opaque, weights, total):
         total[r, 3], total[r, 4] = opacity, far
 
 
-@njit(parallel=True, **EXACT)
+@njit(exact=True, parallel=True)
 def take_samples(rays, first, starts, points, distances, taken):
     """Gather the next samples of some rays contiguously."""
     ray_taken, points_taken, distances_taken = taken
@@ -157,7 +152,7 @@ def take_samples(rays, first, starts, points, distances, taken):
                 points_taken[n, axis] = points[source, axis]
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def composite_on(optical_depth, colour, distances, rays, starts, opaque, limit, before, total):
     """Continue `composite` on rays with their next samples, up to a limit of optical depth."""
     for i in prange(len(rays)):
@@ -182,7 +177,7 @@ def composite_on(optical_depth, colour, distances, rays, starts, opaque, limit, 
         total[r, 0], total[r, 1], total[r, 2] = red, green, blue
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def composite_backward(
     optical_depth, colour, distances, starts, opaque, weights, gradient, d_depth, d_colour
 ):

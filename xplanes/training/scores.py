@@ -16,14 +16,12 @@ from xplanes.metrics import psnr, ssim
 from xplanes.rendering.base import Renderer, leave_empty
 from xplanes.scenes.datamodule import whole_view
 from xplanes.scenes.frame import Frame
+from xplanes.scenes.matte import SOLID
 from xplanes.scenes.views import Views
 from xplanes.training.meters import Tally
 
 VISIBLE = 0.05
 """Opacity above which a background pixel counts as a floater."""
-
-SOLID = 128
-"""Coverage by the foreground object, out of 255, from which a pixel counts as foreground."""
 
 
 @dataclass(frozen=True)

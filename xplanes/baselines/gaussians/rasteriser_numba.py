@@ -20,11 +20,6 @@ from xplanes.baselines.gaussians.reference import (
     MOST_ALPHA,
 )
 
-EXACT = {"nogil": True, "fastmath": False, "error_model": "numpy"}
-COMPILE = {**EXACT, "fastmath": {"contract"}}
-SUMS = {**EXACT, "fastmath": {"contract", "reassoc"}}
-"""For loops with vectorised sums; their order is fixed at compile time."""
-
 TILE_WIDTH, TILE_HEIGHT = 16, 32
 """Size of a tile in pixels. A row fills one or more vector registers."""
 
@@ -59,7 +54,7 @@ AT = tuple(np.uint64(plane * PIXELS) for plane in range(PLANES))
 f32 = np.float32
 
 
-@njit(**COMPILE)
+@njit()
 def _view(means, n, camera):
     """Mean in camera coordinates."""
     x, y, z = np.float64(means[n, 0]), np.float64(means[n, 1]), np.float64(means[n, 2])
@@ -70,7 +65,7 @@ def _view(means, n, camera):
     )
 
 
-@njit(**COMPILE)
+@njit()
 def _unit(quaternions, n):
     """Normalised quaternion (shorter if its length is near 0), and its divisor."""
     w, x = np.float64(quaternions[n, 0]), np.float64(quaternions[n, 1])
@@ -79,7 +74,7 @@ def _unit(quaternions, n):
     return w / length, x / length, y / length, z / length, length
 
 
-@njit(**COMPILE)
+@njit()
 def _axes(camera, w, x, y, z, axes):
     """The Gaussian's axes in camera coordinates, as columns. [3, 3]"""
     for row in range(3):
@@ -95,7 +90,7 @@ def _axes(camera, w, x, y, z, axes):
         )
 
 
-@njit(**COMPILE)
+@njit()
 def _covariance(root):
     """Entries and determinant of root root^T + LOW_PASS, and the determinant's root without it."""
     cx = root[0, 1] * root[1, 2] - root[0, 2] * root[1, 1]
@@ -111,7 +106,7 @@ def _covariance(root):
     return xx + LOW_PASS, xy, yy + LOW_PASS, determinant, area, cx, cy, cz
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def project(
     means,
     quaternions,
@@ -174,7 +169,7 @@ def project(
             radii[n] = np.int64(min(np.ceil(3 * np.sqrt(half)), 1e9))
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def project_backward(
     means,
     quaternions,
@@ -308,7 +303,7 @@ def project_backward(
         d_quaternions[n, 3] = (d_k - along * k) / length
 
 
-@njit(**EXACT)
+@njit(exact=True)
 def depth_order(depths, radii):
     """Indices of the Gaussians that are drawn, by depth; a stable radix sort. int64 [M]"""
     count = 0
@@ -337,7 +332,7 @@ def depth_order(depths, radii):
     return order
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def gather(order, projected, whitening, peaks, features, geometry, gathered):
     """Collect the values for blending, in the order of depth."""
     for m in prange(len(order)):
@@ -356,7 +351,7 @@ def gather(order, projected, whitening, peaks, features, geometry, gathered):
             gathered[m, channel] = features[n, channel] if channel < features.shape[1] else f32(0)
 
 
-@njit(**EXACT)
+@njit(exact=True)
 def _span(low, high, size, count):
     """Half-open range of cells with pixel centres between two coordinates."""
     first = np.floor(np.ceil(low - 0.5) / size)
@@ -364,7 +359,7 @@ def _span(low, high, size, count):
     return np.int64(min(max(first, 0.0), count)), np.int64(min(max(last, 0.0), count))
 
 
-@njit(**EXACT)
+@njit(exact=True)
 def _edge(g, low, high):
     """Largest x of an ellipse between two values of y, relative to its mean."""
     shear = -np.float64(g[3]) / g[2]
@@ -376,7 +371,7 @@ def _edge(g, low, high):
     return shear * y + np.sqrt(max(g[6] - (g[4] * y) ** 2, 0.0)) / g[2]
 
 
-@njit(**EXACT)
+@njit(exact=True)
 def _columns(g, row, columns):
     """Range of tiles in one row of tiles that a Gaussian reaches."""
     low = max(row * TILE_HEIGHT + 0.5 - g[1], -g[8])
@@ -385,7 +380,7 @@ def _columns(g, row, columns):
     return _span(g[0] + left - 1e-3, g[0] + right + 1e-3, TILE_WIDTH, columns)
 
 
-@njit(parallel=True, **EXACT)
+@njit(exact=True, parallel=True)
 def count_tiles(geometry, columns, rows, counts):
     """Number of tiles that each Gaussian reaches."""
     for m in prange(len(geometry)):
@@ -398,7 +393,7 @@ def count_tiles(geometry, columns, rows, counts):
         counts[m] = total
 
 
-@njit(parallel=True, **EXACT)
+@njit(exact=True, parallel=True)
 def list_tiles(geometry, columns, rows, starts, tiles, owners):
     """List the tiles of each Gaussian, one Gaussian after the other."""
     for m in prange(len(geometry)):
@@ -412,7 +407,7 @@ def list_tiles(geometry, columns, rows, starts, tiles, owners):
                 slot += 1
 
 
-@njit(**EXACT)
+@njit(exact=True)
 def bin_tiles(tiles, count):
     """Slots by tile, in the order of depth, and offset of each tile's slots. [P], [count + 1]"""
     starts = np.zeros(count + 1, np.int64)
@@ -428,7 +423,7 @@ def bin_tiles(tiles, count):
     return members, starts
 
 
-@njit(**EXACT)
+@njit(exact=True)
 def _power(x):
     """2^x for x <= 0; the polynomial has an error below 2e-9 in [-1/2, 1/2]."""
     x = max(x, f32(-100))
@@ -444,20 +439,20 @@ def _power(x):
     return value * np.int32((np.int32(whole) + 127) << 23).view(np.float32)
 
 
-@njit(**EXACT)
+@njit(exact=True)
 def _alpha(u, v, peak):
     """Alpha before its limits; the rounding is equal in the forward and backward pass."""
     return peak * _power(-(u * u + v * v))
 
 
-@njit(**EXACT)
+@njit(exact=True)
 def _offset(flat, i, mean_x, mean_y, first, shear, last):
     """Whitened offset of a pixel from a mean, and its offset along y in pixels."""
     y = flat[i + AT[Y]] - mean_y
     return first * (flat[i + AT[X]] - mean_x) + shear * y, last * y, y
 
 
-@njit(**EXACT)
+@njit(exact=True)
 def _rows(geometry, m, top):
     """Range of pixels of the tile's rows that a Gaussian reaches."""
     middle, extent = geometry[m, 1] - top, geometry[m, 8]
@@ -465,7 +460,7 @@ def _rows(geometry, m, top):
     return np.uint64(first * TILE_WIDTH), np.uint64(last * TILE_WIDTH)
 
 
-@njit(**EXACT)
+@njit(exact=True)
 def _scattered(step, count):
     """Tile of a step, in an order that balances the load of threads with consecutive steps."""
     stride = np.int64(0.618 * count) + 1
@@ -478,7 +473,7 @@ def _scattered(step, count):
         stride += 1
 
 
-@njit(**EXACT)
+@njit(exact=True)
 def _open(buffer, tile, columns):
     """Initialise the buffer of a tile, and return the tile's corner."""
     top, left = tile // columns * TILE_HEIGHT, tile % columns * TILE_WIDTH
@@ -490,7 +485,7 @@ def _open(buffer, tile, columns):
     return top, left
 
 
-@njit(**COMPILE)
+@njit()
 def _blend_one(flat, begin, end, member, geometry, features, m, group):
     mean_x, mean_y, peak = geometry[m, 0], geometry[m, 1], geometry[m, 5]
     first, shear, last = geometry[m, 2], geometry[m, 3], geometry[m, 4]
@@ -514,7 +509,7 @@ def _blend_one(flat, begin, end, member, geometry, features, m, group):
         flat[i + AT[F3]] += weight * f3
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def blend(geometry, features, owners, members, starts, columns, image, opacity, state):
     """Blend features; ``state`` stores final transmittance and STOP for `blend_backward`."""
     height, width, channels = image.shape
@@ -546,7 +541,8 @@ def blend(geometry, features, owners, members, starts, columns, image, opacity, 
             state[tile, 0, i], state[tile, 1, i] = buffer[LEFT, i], buffer[STOP, i]
 
 
-@njit(**SUMS)
+# Vectorised sums, whose order is fixed at compile time.
+@njit(fastmath={"contract", "reassoc"})
 def _blend_one_backward(flat, begin, end, member, geometry, features, m, group, sums):
     """Add to ``sums``: moments of alpha times its gradient, and gradients of features."""
     mean_x, mean_y, peak = geometry[m, 0], geometry[m, 1], geometry[m, 5]
@@ -591,7 +587,7 @@ def _blend_one_backward(flat, begin, end, member, geometry, features, m, group, 
     sums[6], sums[7], sums[8], sums[9] = d0, d1, d2, d3
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def blend_backward(
     geometry, features, owners, members, starts, columns, state, d_image, d_opacity, partial
 ):
@@ -648,7 +644,7 @@ def blend_backward(
                     partial[slot, MOMENTS + group + entry] = sums[MOMENTS + entry]
 
 
-@njit(parallel=True, **COMPILE)
+@njit(parallel=True)
 def scatter(order, geometry, slots, partial, d_projected, d_whitening, d_peaks, d_features):
     """Sum the gradients over tiles. Those of Gaussians that are not drawn are unchanged."""
     for m in prange(len(order)):

@@ -11,14 +11,12 @@ import numpy as np
 
 from xplanes.backend import njit
 
-COMPILE = {"nogil": True, "error_model": "numpy"}
-
 INF = math.inf
 INWARD = 0.998
 TRACE = 96
 
 
-@njit(forceinline=True, **COMPILE)
+@njit(exact=True, forceinline=True)
 def ball(ox, oy, oz, dx, dy, dz, radius):
     along = ox * dx + oy * dy + oz * dz
     fx, fy, fz = ox - along * dx, oy - along * dy, oz - along * dz
@@ -29,14 +27,14 @@ def ball(ox, oy, oz, dx, dy, dz, radius):
     return -along - reach, -along + reach
 
 
-@njit(forceinline=True, **COMPILE)
+@njit(exact=True, forceinline=True)
 def slab(origin, direction, half):
     inverse = 1 / (direction if abs(direction) > 1e-12 else 1e-12)
     reach = half * abs(inverse)
     return -origin * inverse - reach, -origin * inverse + reach
 
 
-@njit(**COMPILE)
+@njit(exact=True)
 def cylinder(ox, oy, oz, dx, dy, dz, radius, half):
     near, far = slab(oz, dz, half)
     square = dx * dx + dy * dy
@@ -56,7 +54,7 @@ def cylinder(ox, oy, oz, dx, dy, dz, radius, half):
     return near, far
 
 
-@njit(**COMPILE)
+@njit(exact=True)
 def distance(kind, a, b, c, x, y, z):
     """Signed distance of a point to a solid, in its own coordinates."""
     if kind == 1:
@@ -76,7 +74,7 @@ def distance(kind, a, b, c, x, y, z):
     return out + min(max(u, v, w), 0.0)
 
 
-@njit(**COMPILE)
+@njit(exact=True)
 def hit(kind, a, b, c, ox, oy, oz, dx, dy, dz):
     """Distance at which a ray from outside enters a solid, in its own coordinates."""
     near, far = INF, -INF
@@ -113,7 +111,7 @@ def hit(kind, a, b, c, ox, oy, oz, dx, dy, dz):
     return near if near > 0 else far
 
 
-@njit(**COMPILE)
+@njit(exact=True)
 def normal(kind, a, b, c, x, y, z):
     """Outward unit normal at a point on a solid, in its own coordinates."""
     if kind == 0:
@@ -138,12 +136,12 @@ def normal(kind, a, b, c, x, y, z):
     return x / length, y / length, z / length
 
 
-@njit(forceinline=True, **COMPILE)
+@njit(exact=True, forceinline=True)
 def cell(value, width):
     return math.floor(value * (INWARD / width))
 
 
-@njit(**COMPILE)
+@njit(exact=True)
 def paint(pattern, paints, n, x, y, z):
     """Colour of a pattern at a point, in the part's coordinates."""
     index = 0
@@ -185,7 +183,7 @@ def paint(pattern, paints, n, x, y, z):
     return paints[index, 0], paints[index, 1], paints[index, 2]
 
 
-@njit(**COMPILE)
+@njit(exact=True)
 def first(parts, ox, oy, oz, dx, dy, dz, any_hit):
     """Distance to the first part on a ray and its index; any hit part if ``any_hit``."""
     kinds, sizes, rotations, centres, reach = parts[:5]
@@ -215,7 +213,7 @@ def first(parts, ox, oy, oz, dx, dy, dz, any_hit):
     return best, found
 
 
-@njit(**COMPILE)
+@njit(exact=True)
 def shade(parts, p, x, y, z, result):
     """Normal (0 to 2) and shaded colour (3 to 5) of part p at a point on its surface."""
     kinds, sizes, rotations, centres, _, patterns, paints, numbers, light = parts
@@ -245,7 +243,7 @@ def shade(parts, p, x, y, z, result):
     result[5] = min(blue * strength, 1.0)
 
 
-@njit(**COMPILE)
+@njit(exact=True)
 def cast(parts, origins, directions, distances, owners, seen):
     """First surface on each ray: its distance, part, normal and colour."""
     for i in range(len(origins)):
@@ -256,7 +254,7 @@ def cast(parts, origins, directions, distances, owners, seen):
             shade(parts, p, o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2], seen[i])
 
 
-@njit(**COMPILE)
+@njit(exact=True)
 def inside(parts, points, result):
     """Which points lie inside any part."""
     kinds, sizes, rotations, centres, reach = parts[:5]
@@ -275,7 +273,7 @@ def inside(parts, points, result):
                 break
 
 
-@njit(**COMPILE)
+@njit(exact=True)
 def render(parts, rectangles, pose, focal, samples, colour, alpha, depth):
     """An image on white, its opacity, and the depth of each pixel's first sample."""
     kinds, sizes, rotations, centres = parts[:4]

@@ -21,8 +21,18 @@ _processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 torch.set_num_threads(max(1, torch.get_num_threads() // _processes))
 
 
+WINGS = tuple(Path(__file__).parent / name for name in ("baselines", "synthetic"))
+"""Their tests run in a CI job of their own (`pytest -m "slow or not slow"`)."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Make the device known before the first backward pass, which counts the devices."""
+    """Mark the wings' tests, and make the fake device known.
+
+    The first backward pass counts the devices.
+    """
+    for item in items:
+        if any(wing in item.path.parents for wing in WINGS):
+            item.add_marker(pytest.mark.slow)
     if any("fake_gpu" in getattr(item, "fixturenames", ()) for item in items):
         from tests.fake_device import register
 

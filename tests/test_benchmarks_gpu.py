@@ -12,7 +12,10 @@ import torch
 
 FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
 
-pytestmark = pytest.mark.skipif(torch.cuda.is_available(), reason="for machines without a GPU")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(torch.cuda.is_available(), reason="for machines without a GPU"),
+]
 
 
 @pytest.fixture

@@ -126,6 +126,7 @@ def commands() -> list[list[str]]:
     ]
 
 
+@pytest.mark.slow
 def test_training_commands_of_the_pages_compose():
     training = [words[1:] for words in commands() if words[:1] == ["train"]]
     assert len(training) > 12
@@ -206,6 +207,7 @@ def keys_of(node: Any) -> Iterator[str]:
         yield from keys_of(value[0] if isinstance(value, list) and value else value)
 
 
+@pytest.mark.slow
 def test_the_glossary_has_every_column_and_key_that_a_run_writes(scenes, tmp_path):
     changes = ("lrm=tiny", "preparation.frames=3", f"preparation.cache={tmp_path / 'cache'}")
     config = small_config(scenes, *changes, "trainer.max_steps=2", "media=true")

@@ -69,6 +69,7 @@ def values_of(found: list[list[str]], key: str) -> list[str]:
     return list(dict.fromkeys(t.partition("=")[2] for t in texts if t.startswith(f"{key}=")))
 
 
+@pytest.mark.slow
 def test_sweeps_have_the_papers_scenes_and_rows():
     for name, (scenes, runs) in PAPER.items():
         found = jobs_of(f"sweep={name}")
@@ -144,6 +145,7 @@ def cases() -> Iterator[tuple[str, ...]]:
         yield from sorted(different)
 
 
+@pytest.mark.slow
 def test_jobs_build_and_do_a_step():
     found = list(cases())
     assert len(found) > 60

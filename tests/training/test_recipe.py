@@ -316,6 +316,7 @@ def test_a_run_logs_every_term_in_its_loss(model, scenes, tmp_path):
 NAMED = tuple(text for text in TINY if text != "lrm=none")
 
 
+@pytest.mark.slow
 def test_it_runs_on_a_scene_off_centre(scenes, tmp_path, reduced):
     given = "lrm=tiny", f"data.root={scenes}", "data=suite", "data.scene=off_centre"
     check_runs(changed(("recipe=paper", *NAMED), *given), tmp_path)

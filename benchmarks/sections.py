@@ -40,7 +40,8 @@ DATA: dict[str, Path] = {
 
 MEASURED = ("data", "model", "lrm", "preparation", "decomposition", "losses", "trainer")
 NOT_MEASURED = re.compile(
-    r".*_target_$|data\.(root|cache)|preparation\.cache|lrm\.weights|trainer\.(?!max_|accumulate|g)"
+    r".*_target_$|data\.(root|cache)|preparation\.cache|lrm\.(weights|triplanes)"
+    r"|trainer\.(?!max_|accumulate|g)"
 )
 """Settings that change nothing of what is measured: where things lie, what classes are called."""
 

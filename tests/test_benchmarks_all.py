@@ -167,9 +167,12 @@ def test_pages_show_what_the_records_say(every, monkeypatch):
 
 
 @pytest.mark.slow
-def test_settings_of_all_cases_exist(every):
+def test_settings_of_all_cases_exist_and_name_no_folder(every):
     for name, section in every.every_section().items():
-        assert all(section.settings().values()), name
+        for case, settings in section.settings().items():
+            assert settings, (name, case)
+            folders = [key for key, value in settings.items() if str(value).startswith("/")]
+            assert not folders, (name, case)
 
 
 def test_printed_commands_name_no_folder(every):

@@ -97,6 +97,7 @@ def test_published_resolutions_and_lrms_are_those_that_are_swept():
         assert {entry["model"] for entry in entries} == set(values_of(found, "model"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(), (SMALL,)], ids=str)
 def test_every_choice_of_every_sweep_exists(size):
     groups = ("model", "lrm", "recipe", "model/sampler")

@@ -214,6 +214,7 @@ def baseline(model, kind):
     return module
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", BASELINES)
 def test_baselines_see_the_world_in_their_own_way(model):
     module = baseline(model, "world")
@@ -233,6 +234,7 @@ def test_baselines_see_the_world_in_their_own_way(model):
     )
 
 
+@pytest.mark.slow
 def test_what_is_behind_a_box_begins_where_rays_leave_it():
     module = baseline("tineuvox_s", "world")
     field, renderer = module.field, module.renderer

@@ -375,7 +375,7 @@ class OccupancySampler(Sampler):
         # On a GPU the number of slots would not follow when the number of samples doubles.
         on_cpu = self.device.type == "cpu"
         if on_cpu and self.settings.coarse_first and state.step < self.pruned_at:
-            training = replace(training, samples=training.samples // 2)
+            training = replace(training, samples=max(1, training.samples // 2))
         # On other devices the selection costs more than it saves.
         thins = self.settings.thinning > 0 and on_cpu
         thins = thins and torch.is_grad_enabled() and isinstance(field, nn.Module)

@@ -211,7 +211,7 @@ def test_every_option_composes_and_reads(overrides, tmp_path):
             for name in ("kplanes_explicit", *MODELS_OF_A_KIND)
         ),
     ],
-    ids=lambda overrides: " ".join(overrides),
+    ids=" ".join,
 )
 def test_every_class_of_models_builds_and_renders(overrides):
     module, batches = built(small(*overrides), scene_of())

@@ -126,7 +126,6 @@ def commands() -> list[list[str]]:
     ]
 
 
-@pytest.mark.slow
 def test_training_commands_of_the_pages_compose():
     training = [words[1:] for words in commands() if words[:1] == ["train"]]
     assert len(training) > 12

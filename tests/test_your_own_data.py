@@ -149,7 +149,7 @@ def test_inspect_as_the_page_says(words, place, monkeypatch, capsys):
 
 
 def small(words: list[str]) -> list[str]:
-    """A command's settings, with what makes a run last a moment."""
+    """A command's settings, with what makes a run short."""
     kept = [text for text in SMALL if not text.startswith(("data.", "lrm="))]
     sizes = ["data.resolution=24" if text == "data.resolution=400" else text for text in words]
     if "data=llff" in words:  # Whose images are looked for at 400 pixels if nobody says more.

@@ -230,8 +230,8 @@ def njit(*, exact: bool = False, **options: Any) -> Callable[[Callable[..., Any]
         options: As for `numba.njit`.
     """
     numba = importlib.import_module("numba")
-    fixed = {"nogil": True, "error_model": "numpy"}
-    options = fixed | {"fastmath": False if exact else {"contract"}} | options
+    fastmath = False if exact else {"contract"}
+    options = {"nogil": True, "error_model": "numpy", "fastmath": fastmath} | options
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:

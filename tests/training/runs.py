@@ -3,13 +3,10 @@
 import copy
 import functools
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import hydra
-import pytest
 import torch
 from hydra import initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -20,8 +17,6 @@ from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Scene
 from xplanes.training.fit import Trainer
 from xplanes.training.module import RadianceModule
-
-COMPOSE = hydra.compose
 
 SMALL = (
     "lrm=none",
@@ -48,15 +43,10 @@ SMALL = (
 
 
 @functools.cache
-def _compose(*overrides: str) -> DictConfig:
-    return COMPOSE("train", list(overrides))
-
-
-@functools.cache
 def composed(*overrides: str) -> DictConfig:
     """What Hydra makes of these overrides; composing takes a fifth of a second."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return _compose(*overrides)
+        return hydra.compose("train", list(overrides))
 
 
 @functools.cache
@@ -119,15 +109,3 @@ def status(folder: Path) -> dict[str, Any]:
 def checkpoint(folder: Path, name: str = "last") -> dict[str, Any]:
     """A checkpoint of a run."""
     return torch.load(folder / "checkpoints" / f"{name}.ckpt", weights_only=True)
-
-
-@contextmanager
-def composing_once() -> Iterator[None]:
-    """While command lines are checked, compose each choice of options but once."""
-
-    def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
-        return _compose(*overrides) if name == "train" else COMPOSE(name, list(overrides))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hydra, "compose", compose)
-        yield

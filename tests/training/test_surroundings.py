@@ -128,7 +128,7 @@ def test_time_planes_wait_as_long_as_light_that_passes_the_cube_costs():
 def test_large_views_are_few_and_surroundings_wait_after_the_first_step():
     at = [0.0, 0.05, 0.1, 0.7]
     views = scene("white").splits["train"]
-    many = 400_000 // (views.height * views.width)
+    many = 200_000 // (views.height * views.width)
     assert affordable(at, 1.0, views, surrounded=True) == ([0.0, 0.1, 0.7], many)
     assert affordable(at, 1.0, views, surrounded=False) == (at, many)
     large = SimpleNamespace(height=400, width=500)

@@ -81,6 +81,11 @@ class ImageLRMSettings(InitialiserSettings, ABC):
                 "lrm.crop=false or lrm.matching=scale"
             )
 
+    @property
+    def model_name(self) -> str:
+        """Name of the LRM, which may be chosen by other settings than ``name``."""
+        return self.name if self.weights is None else Path(self.weights).name
+
     @abstractmethod
     def load_model(self, say: Callable[[str], None]) -> LoadedLRM:
         """Find the weights, download them if necessary, and load them.
@@ -129,7 +134,7 @@ def reconstruct(
         logger.warning(
             "the frames of the fixed-view video have no transparency: %s will reconstruct the "
             "background as part of the object; remove it (RGBA), or set lrm=none",
-            options.name,
+            options.model_name,
         )
     place.say(f"lrm: {len(frames)} frames to triplanes")
     encoded = encode(
@@ -159,8 +164,8 @@ def reconstruct(
         "mismatch_pixels": {"largest": apart.largest, "mean": apart.mean},
     }
     description = (
-        f"{options.name} ({model.config.architecture}) on {video.description}, image and field "
-        f"up to {apart.largest:.1f} px apart"
+        f"{options.model_name} ({model.config.architecture}) on {video.description}, image and "
+        f"field up to {apart.largest:.1f} px apart"
     )
     return Reconstruction(
         TriplaneSequence(

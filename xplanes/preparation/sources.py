@@ -43,6 +43,10 @@ class BundledLRMSettings(ImageLRMSettings):
 
     bundled: str  # Name of the bundled LRM.
 
+    @property
+    def model_name(self) -> str:
+        return self.bundled if self.weights is None else super().model_name
+
     def load_model(self, say: Callable[[str], None]) -> LoadedLRM:
         began = time.perf_counter()
         if self.weights is None:

@@ -4,7 +4,7 @@ import numpy as np
 from torch import Tensor
 
 SOLID = 128
-"""Alpha, out of 255, from which a pixel shows rather the object than what is behind it."""
+"""Alpha, out of 255, from which a pixel counts as foreground."""
 
 VISIBLE = 20
 """Alpha, out of 255, from which a pixel is visible: far above the noise of mattes, but far below

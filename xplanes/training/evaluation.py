@@ -23,7 +23,7 @@ from xplanes.training.scores import mean
 SHOWN = 4
 """Number of views whose images are logged at each evaluation."""
 
-ROW, LEAST_VIEWS = 400_000, 2
+ROW, LEAST_VIEWS = 200_000, 2
 """Pixels that a row of the curve scores by default, in at least so many views."""
 
 FIRST_SHARE = 0.1

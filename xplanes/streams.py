@@ -55,17 +55,24 @@ class Stream(IntEnum):
     """Choice of the samples that receive gradients."""
     UNSEEN = 1_000_507
     """Random rays of the prior on the background's unseen directions."""
+    PRETRAINING_BATCHES = 1_000_541
+    """Views, points, rays and augmentation of the batches that pretrain LRMs."""
+    PRETRAINING_ORDER = 1_000_583
+    """Order of the objects in an epoch of pretraining."""
 
 
-def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:
+def step_generator(
+    seed: int, step: int, stream: int = 0, device: torch.device | str = "cpu"
+) -> torch.Generator:
     """A generator that depends only on its arguments.
 
     Args:
         seed: The run's seed.
         step: The training step.
         stream: Separates independent uses: a `Stream`, or the rank of a process.
+        device: Where numbers are drawn; numbers differ between kinds of devices.
     """
-    return torch.Generator().manual_seed(_key(seed, step, stream))
+    return torch.Generator(device).manual_seed(_key(seed, step, stream))
 
 
 def _key(seed: int, step: int, stream: int) -> int:

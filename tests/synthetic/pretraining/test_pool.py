@@ -9,6 +9,7 @@ import torch
 from tests.synthetic.pretraining.small import SIDE, small_pool
 from xplanes.errors import ConfigError
 from xplanes.lrm.canonical import OPENLRM_VIEW, CanonicalView
+from xplanes.streams import step_generator
 from xplanes.synthetic.pretraining import pool as pool_module
 from xplanes.synthetic.pretraining.objects import TRAINING_SEEDS, procedural_object
 from xplanes.synthetic.pretraining.pool import (
@@ -113,17 +114,10 @@ def test_batches_depend_on_seed_and_step_alone():
     assert not torch.equal(first.draw(4).points, first.draw(5).points)
 
 
-def test_every_object_is_used_once_per_epoch(monkeypatch):
-    seen, data = [], batches(small_pool(6))
-    real = PretrainingBatches._sample
-    monkeypatch.setattr(
-        PretrainingBatches,
-        "_sample",
-        lambda self, record, random: (seen.append(record.tobytes()), real(self, record, random))[1],
-    )
-    for step in range(2):
-        data.draw(step)
-    assert len(set(seen)) == 6
+def test_every_object_is_used_once_per_epoch():
+    data = batches(small_pool(6))
+    assert sorted(torch.cat([data._objects(0), data._objects(1)]).tolist()) == list(range(6))
+    assert data._objects(2).tolist() != data._objects(0).tolist()
 
 
 def test_images_points_and_rays_lie_in_one_frame():
@@ -148,28 +142,54 @@ def test_images_points_and_rays_lie_in_one_frame():
         mirrored.add(float(batch.points[0, 0, 0]) > 0)
 
 
+def one_object(**counts):
+    """Batches of one object, its record, and the turn of one of its views."""
+    data = batches(small_pool(1), objects=1, **counts)
+    record = data.pool.records(torch.tensor([0]))
+    return data, record, data._turn(record["poses"][:, 1])
+
+
 def test_free_points_are_empty_and_in_the_box():
-    solids, data = (
-        procedural_object(0),
-        batches(small_pool(1), objects=1, near=0, volume=0, free=400),
-    )
-    record = data.pool[0]
-    turn = data._turn(record["poses"][1])
-    points = data._free_points(record, 1, turn, np.random.default_rng(0))
-    assert np.abs(points).max() <= 1 + 1e-9
-    world = points @ np.linalg.inv(turn).T
-    assert inside(solids, world).mean() < 0.005
-    assert np.ptp(points, axis=0).min() > 1.2
+    solids, (data, record, turn) = procedural_object(0), one_object(near=0, volume=0, free=400)
+    points = data._free_points(record, torch.tensor([1]), turn, step_generator(0, 0))[0]
+    assert points.abs().max() <= 1 + 1e-6
+    world = points @ torch.linalg.inv(turn[0]).T
+    assert inside(solids, world.double().numpy()).mean() < 0.005
+    assert np.ptp(points.numpy(), axis=0).min() > 1.2
 
 
 def test_rays_hit_where_the_object_is():
-    solids, data = procedural_object(0), batches(small_pool(1), objects=1)
-    record = data.pool[0]
-    turn = data._turn(record["poses"][0])
-    random = np.random.default_rng(1)
-    origins, directions, _, hits = data._rays(record, 0, turn, random, 200, middle=False)
-    back = np.linalg.inv(turn)
+    solids, (data, record, turn) = procedural_object(0), one_object()
+    origins, directions, _, hits = (
+        part[0].double().numpy()
+        for part in data._rays(
+            record, torch.tensor([1]), turn, step_generator(1, 0), 200, middle=False
+        )
+    )
+    back = torch.linalg.inv(turn[0]).double().numpy()
     distance = cast(solids, origins @ back.T, directions @ back.T * data.scale)[0] * data.scale
     both = np.isfinite(hits) & np.isfinite(distance)
     assert (np.isfinite(hits) == np.isfinite(distance)).mean() > 0.98
     assert np.quantile(np.abs(hits[both] - distance[both]), 0.95) < 3e-3
+
+
+def test_a_pool_in_memory_gives_what_one_on_disk_gives():
+    disk, numbers = small_pool(6), torch.tensor([4, 1])
+    names = disk.shards[0].dtype.names
+    disk.resident = {name: torch.tensor(disk.shards[0][name]) for name in names}
+    held, disk.resident = disk.records(numbers), None
+    assert {name: value.dtype for name, value in held.items()} == {
+        name: value.dtype for name, value in disk.records(numbers).items()
+    }
+    assert all(torch.equal(held[name], value) for name, value in disk.records(numbers).items())
+
+
+@pytest.mark.slow
+def test_processes_generate_the_same_shards(tmp_path):
+    folders = tmp_path / "one", tmp_path / "two"
+    for folder, workers in zip(folders, (1, 2), strict=True):
+        seeds = TRAINING_SEEDS[: 2 * pool_module.SHARD]
+        ensure_pool(folder, seeds, views=2, side=8, workers=workers, announce=silent)
+    one, two = (json.loads((folder / "pool.json").read_text()) for folder in folders)
+    assert one == two
+    assert len(one["sha256"]) == 2

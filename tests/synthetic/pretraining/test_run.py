@@ -151,6 +151,7 @@ def test_losses_fall():
     )  # fmt: skip
     loss, parts = taught.losses(data.draw(0))
     first, options = float(loss.detach()), config.schedule
+    parts = {name: float(value) for name, value in parts.items()}
     rendered = parts["render"] + 0.3 * parts["opacity"]
     total = parts["occupancy"] + options.colour_weight * parts["colour"]
     assert first == pytest.approx(total + options.render_weight * rendered, rel=1e-5)

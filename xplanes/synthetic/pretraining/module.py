@@ -3,7 +3,7 @@
 import copy
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from xplanes.errors import ConfigError
 from xplanes.files import replacing
@@ -65,7 +66,7 @@ class PretrainingModule(LightningModule):
         self.batch, self.schedule, self.seed, self.bf16 = batch, schedule, seed, bf16
         self.camera = canonical_vector(model.view)
         self.steps, self.clock, self.unusable = 0, 0.0, 0
-        self.last: dict[str, float] = {}
+        self.last: dict[str, float | Tensor] = {}
 
     @property
     def progress(self) -> float:
@@ -113,12 +114,10 @@ class PretrainingModule(LightningModule):
             optimizer.zero_grad()
         self.steps += 1
         keep = min(self.schedule.average, (1 + self.steps) / (10 + self.steps))
-        with torch.no_grad():
-            for mean, value in zip(self.average.parameters(), self.model.parameters(), strict=True):
-                mean.lerp_(value, 1 - keep)
-        self.last = {**parts, "gradient": float(norm), "rate": self.rate}
+        get_ema_multi_avg_fn(keep)([*self.average.parameters()], [*self.model.parameters()], 0)
+        self.last = {**parts, "gradient": norm, "rate": self.rate}
 
-    def losses(self, batch: PretrainingBatch) -> tuple[Tensor, dict[str, float]]:
+    def losses(self, batch: PretrainingBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of a batch, and its terms by name."""
         options, decoder = self.schedule, self.model.decoder
         with torch.autocast(batch.images.device.type, torch.bfloat16, enabled=self.bf16):
@@ -130,26 +129,25 @@ class PretrainingModule(LightningModule):
         occupancy = occupancy_loss(logits[:, :count], batch.inside)
         colour = colour_loss(logits[:, count:], batch.colours, decoder.colour_margin)
         loss = occupancy + options.colour_weight * colour
-        parts = {"occupancy": float(occupancy.detach()), "colour": float(colour.detach())}
+        parts = {"occupancy": occupancy.detach(), "colour": colour.detach()}
         if self.batch.rays and self.progress >= options.render_from:
             rendered, seen = self._rendered(planes, batch)
             error = (rendered - batch.ray_colours).square().mean()
             opacity = (seen - batch.ray_alpha).square().mean()
             loss = loss + options.render_weight * (error + 0.3 * opacity)
-            parts |= {"render": float(error.detach()), "opacity": float(opacity.detach())}
+            parts |= {"render": error.detach(), "opacity": opacity.detach()}
         return loss, parts
 
     def _rendered(self, planes: Tensor, batch: PretrainingBatch) -> tuple[Tensor, Tensor]:
         shape = (*batch.ray_hits.shape, self.batch.samples)
-        jitter = torch.rand(
-            shape, generator=step_generator(self.seed, self.steps, Stream.PRETRAINING)
-        )
+        random = step_generator(self.seed, self.steps, Stream.PRETRAINING, planes.device)
+        jitter = torch.rand(shape, generator=random, device=planes.device)
         distances, lengths = ray_samples(
             batch.origins,
             batch.directions,
             batch.ray_hits,
             half_side=self.model.half_side,
-            jitter=jitter.to(planes),
+            jitter=jitter,
         )
         points = batch.origins[:, :, None] + distances[..., None] * batch.directions[:, :, None]
         with torch.autocast(planes.device.type, torch.bfloat16, enabled=self.bf16):
@@ -261,8 +259,10 @@ class Upkeep(Callback):
         self.since[what] = clock
         return True
 
-    def _log(self, trainer: Trainer, module: PretrainingModule, values: dict[str, float]) -> None:
-        logger = trainer.logger
+    def _log(
+        self, trainer: Trainer, module: PretrainingModule, found: Mapping[str, float | Tensor]
+    ) -> None:
+        logger, values = trainer.logger, {name: float(value) for name, value in found.items()}
         assert isinstance(logger, TensorBoardLogger)
         logger.log_metrics({**values, "seconds": module.clock}, step=module.steps)
         shown = "  ".join(f"{name} {value:.4g}" for name, value in values.items())

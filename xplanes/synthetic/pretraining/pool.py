@@ -2,8 +2,9 @@
 
 import hashlib
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+import multiprocessing
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,15 +12,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
 
 from xplanes.backend import compiled
 from xplanes.errors import ConfigError
 from xplanes.files import read_json, replacing, write_json
 from xplanes.lrm.canonical import CanonicalView
 from xplanes.scenes.cameras import look_at
+from xplanes.streams import Stream, step_generator
 from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE
 from xplanes.synthetic.pretraining.objects import procedural_object
 from xplanes.synthetic.pretraining.solids import Array, Solids
+
+CPU = torch.device("cpu")
 
 FOCAL = 0.5 / math.tan(0.5 * CAMERA_ANGLE_X)
 """Focal length of D-NeRF's cameras as a share of the image side."""
@@ -190,16 +195,27 @@ SHARD = 256
 
 RECORD = "pool.json"
 
+Records = dict[str, Tensor]
+"""Fields of `sample_type` by name, of several objects. [B, ...] each"""
 
-@dataclass(frozen=True)
+
 class Pool:
-    """Records of objects, read from disk on demand.
+    """Records of objects: on a GPU in its memory, else read from disk on demand.
 
-    Attributes:
+    Args:
         shards: Memory-mapped records of `sample_type`. [SHARD] each
+        device: Where records are wanted.
     """
 
-    shards: tuple[NDArray, ...]
+    def __init__(self, shards: tuple[NDArray, ...], device: torch.device = CPU) -> None:
+        self.shards, self.device = shards, device
+        self.resident: Records | None = None
+        if device.type != "cpu":
+            names = shards[0].dtype.names or ()
+            self.resident = {
+                name: torch.cat([torch.tensor(shard[name], device=device) for shard in shards])
+                for name in names
+            }
 
     def __len__(self) -> int:
         return sum(len(shard) for shard in self.shards)
@@ -209,6 +225,14 @@ class Pool:
         shard, index = divmod(number, SHARD)
         return self.shards[shard][index]
 
+    def records(self, numbers: Tensor) -> Records:
+        """The records of objects by their indices in the pool. [B]"""
+        if self.resident is not None:
+            numbers = numbers.to(self.device)
+            return {name: values[numbers] for name, values in self.resident.items()}
+        rows = np.stack([self[number] for number in numbers.tolist()])
+        return {name: torch.tensor(rows[name]) for name in rows.dtype.names or ()}
+
 
 def ensure_pool(
     folder: Path,
@@ -216,6 +240,8 @@ def ensure_pool(
     *,
     views: int,
     side: int,
+    device: torch.device = CPU,
+    workers: int = 1,
     announce: Callable[[str], None] = print,
 ) -> Pool:
     """Records of all objects with these seeds; missing shards are generated.
@@ -225,6 +251,8 @@ def ensure_pool(
         seeds: Seeds of the objects, a whole number of shards.
         views: Images per object.
         side: Height and width of an image in pixels.
+        device: Where the records are wanted.
+        workers: Processes that generate shards; 1 for this one.
         announce: Receives progress messages.
 
     Raises:
@@ -234,20 +262,40 @@ def ensure_pool(
         raise ConfigError(f"pool.objects={len(seeds)}: must be a multiple of {SHARD}")
     kind = {"version": VERSION, "first": seeds.start, "views": views, "side": side, "shard": SHARD}
     record = _read(folder, kind)
-    shards = []
-    for number in range(len(seeds) // SHARD):
-        path = folder / f"{number:05d}.npy"
-        if path.name not in record["sha256"] or record["sha256"][path.name] != _digest(path):
-            first = seeds[number * SHARD]
-            drawn = [draw_sample(seed, views, side) for seed in range(first, first + SHARD)]
-            with replacing(path) as temporary:
-                np.save(temporary, np.concatenate(drawn))
-            record["sha256"][path.name] = _digest(path)
-            write_json(folder / RECORD, record)
-            if number % 8 == 7 or (number + 1) * SHARD == len(seeds):
-                announce(f"generated {(number + 1) * SHARD} of {len(seeds)} objects")
-        shards.append(np.load(path, mmap_mode="r"))
-    return Pool(tuple(shards))
+    paths = [folder / f"{number:05d}.npy" for number in range(len(seeds) // SHARD)]
+    missing = [
+        (path, seeds[number * SHARD : (number + 1) * SHARD], views, side)
+        for number, path in enumerate(paths)
+        if path.name not in record["sha256"] or record["sha256"][path.name] != _digest(path)
+    ]
+    for done, (name, digest) in enumerate(_generated(missing, workers), 1):
+        record["sha256"][name] = digest
+        write_json(folder / RECORD, record)
+        if done % 8 == 0 or done == len(missing):
+            announce(f"generated {done * SHARD} of {len(missing) * SHARD} missing objects")
+    return Pool(tuple(np.load(path, mmap_mode="r") for path in paths), device)
+
+
+Shard = tuple[Path, range, int, int]
+"""File, seeds, views and side of a shard."""
+
+
+def _generated(missing: list[Shard], workers: int) -> Iterator[tuple[str, str | None]]:
+    """Generate shards; gives the name and SHA-256 of each file."""
+    if min(workers, len(missing)) < 2:
+        yield from map(_generate, missing)
+        return
+    draw_sample(missing[0][1][0], *missing[0][2:])  # Compiles, for all processes.
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as processes:
+        yield from processes.map(_generate, missing)
+
+
+def _generate(shard: Shard) -> tuple[str, str | None]:
+    path, seeds, views, side = shard
+    drawn = [draw_sample(seed, views, side) for seed in seeds]
+    with replacing(path) as temporary:
+        np.save(temporary, np.concatenate(drawn))
+    return path.name, _digest(path)
 
 
 def _read(folder: Path, kind: dict[str, int]) -> dict[str, Any]:
@@ -343,105 +391,123 @@ class PretrainingBatches:
         self.pool, self.view, self.seed, self.objects = pool, view, seed, objects
         self.near, self.volume, self.free = near, volume, free
         self.colour, self.rays = colour, rays
+        self.side = pool.shards[0]["pictures"].shape[2]
         self.scale = view.distance / CAMERA_DISTANCE
 
     def draw(self, step: int) -> PretrainingBatch:
         """The batch of a step; each epoch uses every object at most once."""
-        turns = len(self.pool) // self.objects
-        order = np.random.default_rng([self.seed, step // turns]).permutation(len(self.pool))
-        random = np.random.default_rng([self.seed, step, 1])
-        start = step % turns * self.objects
-        drawn = [
-            self._sample(self.pool[int(number)], random)
-            for number in order[start : start + self.objects]
-        ]
-        return PretrainingBatch(
-            *(torch.from_numpy(np.stack(part)).float() for part in zip(*drawn, strict=True))
-        )
-
-    def _sample(self, record: NDArray, random: np.random.Generator) -> tuple[NDArray, ...]:
-        views = len(record["poses"])
-        source = int(random.integers(views))
-        turn = self._turn(record["poses"][source])
-        near = self._near(record, random)
-        chosen = np.concatenate([near, SURFACE + random.integers(VOLUME, size=self.volume)])
-        points, inside = record["points"][chosen] @ turn.T, record["inside"][chosen]
+        device, side, count = self.pool.device, self.side, self.objects
+        random = step_generator(self.seed, step, Stream.PRETRAINING_BATCHES, device)
+        record = self.pool.records(self._objects(step))
+        views = record["poses"].shape[1]
+        source = torch.randint(views, (count,), generator=random, device=device)
+        each = torch.arange(count, device=device)
+        turn = self._turn(record["poses"][each, source])
+        volume = torch.randint(VOLUME, (count, self.volume), generator=random, device=device)
+        chosen = torch.cat([self._near(record, random), SURFACE + volume], dim=1)
+        points = _take(record["points"], chosen).float() @ turn.mT
         free = self._free_points(record, source, turn, random)
-        at = random.integers(SURFACE, size=self.colour)
-        surface = record["surface"][at] + DITHER * random.normal(size=(self.colour, 3))
+        inside = torch.cat([record["inside"].gather(1, chosen), torch.zeros_like(free[..., 0])], 1)
+        at = torch.randint(SURFACE, (count, self.colour), generator=random, device=device)
+        shift = torch.randn(count, self.colour, 3, generator=random, device=device)
+        surface = _take(record["surface"], at).float() + DITHER * shift
         origins, directions, pixels, hits = self._rays(record, source, turn, random, self.rays)
-        image = record["pictures"][source, ..., :3]
+        image = record["pictures"][each, source, ..., :3].permute(0, 3, 1, 2)
         # Augmentation: mirroring and permuting the colour channels.
-        mirror, channels = random.random() < 0.5, random.permutation(3)
-        if mirror:
-            image = image[:, ::-1]
-        sign = np.array([-1.0 if mirror else 1.0, 1.0, 1.0])
-        return (
-            (image[..., channels] / np.float32(255)).transpose(2, 0, 1),
-            np.concatenate([points, free]) * sign,
-            np.concatenate([inside, np.zeros(self.free, np.uint8)]),
-            surface @ turn.T * sign,
-            record["colours"][at][:, channels] / np.float32(255),
-            origins * sign,
-            directions * sign,
-            pixels[:, channels] / np.float32(255),
-            pixels[:, 3] / np.float32(255),
-            hits,
+        mirror = torch.rand(count, 1, 1, 1, generator=random, device=device) < 0.5
+        channels = torch.rand(count, 3, generator=random, device=device).argsort(dim=1)
+        image = torch.where(mirror, image.flip(-1), image)
+        image = image.gather(1, channels[..., None, None].expand(-1, -1, side, side))
+        sign = torch.ones(count, 1, 3, device=device)
+        sign[..., 0] = torch.where(mirror[:, 0, 0], -1.0, 1.0)
+
+        def shown(colours: Tensor) -> Tensor:
+            return colours.gather(2, channels[:, None].expand(colours.shape)) / 255
+
+        return PretrainingBatch(
+            images=image / 255,
+            points=torch.cat([points, free], dim=1) * sign,
+            inside=inside,
+            surface=surface @ turn.mT * sign,
+            colours=shown(_take(record["colours"], at)),
+            origins=origins * sign,
+            directions=directions * sign,
+            ray_colours=shown(pixels[..., :3]),
+            ray_alpha=pixels[..., 3] / 255,
+            ray_hits=hits,
         )
 
-    def _near(self, record: NDArray, random: np.random.Generator) -> NDArray:
-        """Indices of points near the surface: of `TRIES` candidates, the farthest from it. [N]
+    def _objects(self, step: int) -> Tensor:
+        """Indices of a step's objects. [B]"""
+        turns = len(self.pool) // self.objects
+        epoch = step_generator(self.seed, step // turns, Stream.PRETRAINING_ORDER)
+        start = step % turns * self.objects
+        return torch.randperm(len(self.pool), generator=epoch)[start : start + self.objects]
+
+    def _near(self, record: Records, random: torch.Generator) -> Tensor:
+        """Indices of points near the surface: of `TRIES` candidates, the farthest from it. [B, N]
 
         Points much closer to the surface than one texel carry little information.
         """
-        tries = random.integers(SURFACE, size=(TRIES, self.near))
-        apart = record["points"][tries].astype(np.float32) - record["surface"][tries]
-        best = np.square(apart).sum(axis=-1).argmax(axis=0)
-        return tries[best, np.arange(self.near)]
+        shape = self.objects, TRIES * self.near
+        tries = torch.randint(SURFACE, shape, generator=random, device=self.pool.device)
+        apart = _take(record["points"], tries).float() - _take(record["surface"], tries).float()
+        far = apart.square().sum(dim=-1).unflatten(1, (TRIES, self.near))
+        return tries.unflatten(1, (TRIES, self.near)).gather(1, far.argmax(1, keepdim=True))[:, 0]
 
-    def _turn(self, pose: NDArray) -> NDArray:
-        """Rotation and scale from the object's world to the model's frame. [3, 3]"""
-        return self.scale * self.view.rotation_matrix().numpy() @ pose[:3, :3].T.astype(float)
+    def _turn(self, poses: Tensor) -> Tensor:
+        """Rotation and scale from objects' world to the model's frame. [B, 4, 4] -> [B, 3, 3]"""
+        return self.scale * self.view.rotation_matrix().to(poses) @ poses[:, :3, :3].mT
 
     def _rays(
         self,
-        record: NDArray,
-        source: int,
-        turn: NDArray,
-        random: np.random.Generator,
+        record: Records,
+        source: Tensor,
+        turn: Tensor,
+        random: torch.Generator,
         count: int,
         middle: bool = True,
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Rays through pixels: origins, directions, pixels and hits, in the model's frame."""
-        pictures = record["pictures"]
-        views, side = pictures.shape[:2]
-        view = np.where(random.random(count) < 0.5, source, random.integers(views, size=count))
+        objects, views, side = record["pictures"].shape[:3]
+        shape, device = (objects, count), self.pool.device
+        own = torch.rand(shape, generator=random, device=device) < 0.5
+        other = torch.randint(views, shape, generator=random, device=device)
+        view = torch.where(own, source[:, None], other)
+        tries = torch.randint(side * side, (2, *shape), generator=random, device=device)
+        tries = tries + view * side * side
         # Of two candidates, take the second if the first is background: fewer background rays.
-        pixel = random.integers(side, size=(2, count, 2))
-        empty = pictures[view, pixel[0, :, 0], pixel[0, :, 1], 3] == 0
-        row, column = np.where(empty[:, None], pixel[1], pixel[0]).T
+        pictures = record["pictures"].flatten(1, 3)
+        pixel = torch.where(pictures[..., 3].gather(1, tries[0]) == 0, tries[1], tries[0])
+        row, column = pixel % (side * side) // side, pixel % side
         # Depth belongs to the first of the 2 x 2 samples of a pixel.
         shift = 0.5 if middle else 0.25
         up = (0.5 - (row + shift) / side) / FOCAL
         right = ((column + shift) / side - 0.5) / FOCAL
-        local = np.stack([right, up, -np.ones(count)], axis=-1)
-        local /= np.linalg.norm(local, axis=-1, keepdims=True)
-        poses = record["poses"][view].astype(float)
-        directions = np.einsum("rij,rj->ri", poses[:, :3, :3], local) @ turn.T / self.scale
-        origins = poses[:, :3, 3] @ turn.T
-        hits = self.scale * (record["depths"][view, row, column].astype(float) + CAMERA_DISTANCE)
-        return origins, directions, pictures[view, row, column], hits
+        local = functional.normalize(torch.stack([right, up, -torch.ones_like(up)], dim=-1), dim=-1)
+        poses = turn[:, None] @ record["poses"][..., :3, :]
+        at = poses.flatten(2).gather(1, view[..., None].expand(-1, -1, 12)).unflatten(-1, (3, 4))
+        directions = (at[..., :3] @ local[..., None])[..., 0] / self.scale
+        depth = record["depths"].flatten(1).gather(1, pixel).float()
+        hits = self.scale * (depth + CAMERA_DISTANCE)
+        return at[..., 3], directions, _take(pictures, pixel), hits
 
     def _free_points(
-        self, record: NDArray, source: int, turn: NDArray, random: np.random.Generator
-    ) -> NDArray:
-        """Points between the near bound of the box and the first hit of a ray. [F, 3]"""
+        self, record: Records, source: Tensor, turn: Tensor, random: torch.Generator
+    ) -> Tensor:
+        """Points between the near bound of the box and the first hit of a ray. [B, F, 3]"""
         origins, directions, _, hits = self._rays(
             record, source, turn, random, self.free, middle=False
         )
-        inverse = 1 / np.where(np.abs(directions) < 1e-9, 1e-9, directions)
-        reach = self.view.half_side * np.abs(inverse)
-        near = np.max(-origins * inverse - reach, axis=-1)
-        far = np.minimum(np.min(-origins * inverse + reach, axis=-1), hits - 0.01)
-        distance = near + random.random(self.free) * np.maximum(far - near, 0)
-        return origins + distance[:, None] * directions
+        inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
+        reach = self.view.half_side * inverse.abs()
+        near = (-origins * inverse - reach).amax(dim=-1)
+        far = torch.minimum((-origins * inverse + reach).amin(dim=-1), hits - 0.01)
+        share = torch.rand(near.shape, generator=random, device=self.pool.device)
+        distance = near + share * (far - near).clamp_min(0)
+        return origins + distance[..., None] * directions
+
+
+def _take(values: Tensor, at: Tensor) -> Tensor:
+    """Rows of each object. [B, N, C], [B, M] -> [B, M, C]"""
+    return values.gather(1, at[..., None].expand(-1, -1, values.shape[-1]))

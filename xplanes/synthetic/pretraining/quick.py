@@ -1,5 +1,7 @@
 """Scores on a few held-out objects during training."""
 
+import copy
+
 import torch
 from torch import Tensor
 
@@ -29,6 +31,7 @@ class QuickLook:
     @torch.no_grad()
     def scores(self, model: OpenLRM) -> dict[str, float]:
         """IoU at the stored points, and PSNR (dB) of the input view and of the second view."""
+        model = copy.deepcopy(model).cpu()
         found: dict[str, list[float]] = {"iou": [], "psnr_input": [], "psnr_novel": []}
         camera = canonical_vector(model.view)[None]
         for number in range(self.count):

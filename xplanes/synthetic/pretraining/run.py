@@ -3,6 +3,7 @@
 import hashlib
 import itertools
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -140,12 +141,14 @@ def _pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str]
             raise ConfigError(
                 f"{last} is damaged: delete it to start again, or name another run"
             ) from problem
-    module, data, look = assemble(config, announce)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    module, data, look = assemble(config, device, announce)
     if last.is_file():
         announce(f"resuming from {last}")
     interrupt = Interrupt()
     trainer = Trainer(
-        accelerator="cpu",
+        accelerator=device.type,
+        devices=1,
         max_steps=-1,
         max_epochs=-1,
         callbacks=[Upkeep(last, config.schedule, look, announce), interrupt],
@@ -160,11 +163,13 @@ def _pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str]
     checkpoint = str(last) if last.is_file() else None
     with interrupt.exits():
         trainer.fit(module, loader, ckpt_path=checkpoint, weights_only=True)
-    return export(module.average, published_sizes(config.model, FOCAL), run, config.model.name)
+    return export(
+        module.average.cpu(), published_sizes(config.model, FOCAL), run, config.model.name
+    )
 
 
 def assemble(
-    config: PretrainingSettings, announce: Callable[[str], None]
+    config: PretrainingSettings, device: torch.device, announce: Callable[[str], None]
 ) -> tuple[PretrainingModule, PretrainingBatches, QuickLook]:
     """The initialised module, its training batches, and the scores on held-out objects."""
     pool, batch, side = config.pool, config.batch, config.model.image_size
@@ -173,6 +178,8 @@ def assemble(
         TRAINING_SEEDS[: pool.objects],
         views=pool.views,
         side=side,
+        device=device,
+        workers=os.cpu_count() or 1,
         announce=announce,
     )
     shards = math.ceil(config.schedule.score_objects / SHARD)
@@ -189,9 +196,7 @@ def assemble(
         if config.init_from is None
         else _grown(config.init_from, sizes)
     )
-    module = PretrainingModule(
-        model, batch, config.schedule, config.seed, bf16=fast_bf16(torch.device("cpu"))
-    )
+    module = PretrainingModule(model, batch, config.schedule, config.seed, bf16=fast_bf16(device))
     data = PretrainingBatches(
         drawn,
         model.view,

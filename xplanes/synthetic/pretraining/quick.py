@@ -1,7 +1,5 @@
 """Scores on a few held-out objects during training."""
 
-import copy
-
 import torch
 from torch import Tensor
 
@@ -31,19 +29,19 @@ class QuickLook:
     @torch.no_grad()
     def scores(self, model: OpenLRM) -> dict[str, float]:
         """IoU at the stored points, and PSNR (dB) of the input view and of the second view."""
-        model = copy.deepcopy(model).cpu()
+        device = model.position.device
         found: dict[str, list[float]] = {"iou": [], "psnr_input": [], "psnr_novel": []}
-        camera = canonical_vector(model.view)[None]
+        camera = canonical_vector(model.view)[None].to(device)
         for number in range(self.count):
-            record = {name: self.pool[number][name].copy() for name in _USED}
-            pictures = torch.from_numpy(record["pictures"][..., :3] / 255).float()
+            record = {name: torch.tensor(self.pool[number][name], device=device) for name in _USED}
+            pictures = record["pictures"][..., :3].float() / 255
             planes = model.triplanes(pictures[:1].permute(0, 3, 1, 2), camera)
-            turn = world_to_model(torch.from_numpy(record["poses"][0]), model)
-            points = torch.from_numpy(record["points"].astype("float32")) @ turn.T
+            turn = world_to_model(record["poses"][0], model)
+            points = record["points"].float() @ turn.T
             solid = triplane_logits(planes, model.decoder, points[None])[0, :, 0] > 1
-            found["iou"].append(overlap(solid, torch.from_numpy(record["inside"]) > 0))
+            found["iou"].append(overlap(solid, record["inside"] > 0))
             for name, view in (("psnr_input", 0), ("psnr_novel", 1)):
-                pose = model_pose(torch.from_numpy(record["poses"][view]), turn)
+                pose = model_pose(record["poses"][view], turn)
                 rendered = render_view(
                     planes, model.decoder, pose, side=pictures.shape[1], focal=FOCAL
                 )
@@ -54,7 +52,9 @@ class QuickLook:
 def world_to_model(source: Tensor, model: LRM) -> Tensor:
     """Scale and rotation from world to model frame, for a source camera. [4, 4] -> [3, 3]"""
     scale = model.view.distance / CAMERA_DISTANCE
-    return (scale * model.view.rotation_matrix() @ source[:3, :3].T.double()).float()
+    return (
+        scale * model.view.rotation_matrix().to(source.device) @ source[:3, :3].T.double()
+    ).float()
 
 
 def model_pose(pose: Tensor, turn: Tensor) -> Tensor:

@@ -35,7 +35,7 @@ def render_view(
     Returns:
         RGB from 0 to 1. [S, S, 3]
     """
-    line, middle = torch.arange(side), (0.5 * side, 0.5 * side)
+    line, middle = torch.arange(side, device=pose.device), (0.5 * side, 0.5 * side)
     rows, columns = torch.meshgrid(line, line, indexing="ij")
     origins, directions = cast_rays(
         pose, rows.flatten(), columns.flatten(), focal=focal * side, centre=middle
@@ -44,10 +44,11 @@ def render_view(
     middle, reach = -origins * inverse, half_side * inverse.abs()
     near, far = (middle - reach).amax(-1), (middle + reach).amin(-1)
     step = (far - near).clamp_min(0) / samples
-    picture = torch.ones(side * side, 3)
+    picture = torch.ones(side * side, 3, device=pose.device)
+    along = torch.arange(samples, device=pose.device) + 0.5
     rays = (step > 0).nonzero()[:, 0]
     for chosen in rays.split(max(1, CHUNK // samples)):
-        distances = near[chosen, None] + step[chosen, None] * (torch.arange(samples) + 0.5)
+        distances = near[chosen, None] + step[chosen, None] * along
         points = origins[chosen, None] + distances[..., None] * directions[chosen, None]
         logits = triplane_logits(planes, decoder, points.flatten(0, 1)[None])[0]
         colours, density = decoder.activate(logits)

@@ -157,8 +157,8 @@ VIDEO_SIZE = 200
 
 
 def video_size(views: Views) -> int:
-    """Side length in pixels of a run's video, given its training views."""
-    return min(VIDEO_SIZE, max(views.height, views.width))
+    """Side length in pixels of a run's video, at most twice that of its training views."""
+    return min(VIDEO_SIZE, 2 * max(views.height, views.width))
 
 
 def back_and_forth(count: int) -> Tensor:

@@ -11,6 +11,7 @@ from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, TypeGuard, TypeVar
+from urllib.parse import unquote
 
 import numpy as np
 import torch
@@ -53,8 +54,9 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
     """The file that ``name`` refers to inside ``folder``.
 
     The suffix may be missing or that of another format, and the name may differ in case or in the
-    encoding of accents, as long as only one file matches. If a path does not exist, such as one of
-    another machine, its first folders are dropped. A name without folders is also tried in images.
+    encoding of accents, as long as only one file matches; it may be percent-encoded. If a path does
+    not exist, such as one of another machine, its first folders are dropped. A name without folders
+    is also tried in images.
 
     Args:
         label: The file and frame that name it, for messages.
@@ -84,6 +86,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         same = [path for path in found if _normalised(path.name) == _normalised(image.name)]
         if len(chosen := same or found) == 1:
             return _with_content(label, chosen[0])
+    if (spelt := unquote(name)) != name:  # Percent-encoded, as in URLs.
+        return image_path(label, folder, spelt, key)
     if Path(name).is_absolute() and Path(name).is_file():
         raise BrokenFrameError(
             f"{label}: {key} leaves the scene's folder {folder}. Put a link to {Path(name).parent} "
@@ -261,14 +265,24 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
     """
     require_fetched(path)
     try:
-        found = _parsed(decoded(path.read_bytes()))
+        found = _parsed(_text(path))
     except (OSError, ValueError, RecursionError) as problem:
-        encoded = isinstance(problem, UnicodeDecodeError)
-        way_out = "Save it as UTF-8" if encoded else "Export or download it again"
-        raise SceneError(f"{path} cannot be read as JSON ({problem}). {way_out}.") from problem
+        raise SceneError(
+            f"{path} cannot be read as JSON ({problem}). Export or download it again."
+        ) from problem
     if not isinstance(found, dict):
         raise SceneError(f"{path} must hold a JSON object with {content}, not {short(found)}.")
     return found
+
+
+def _text(path: Path) -> str:
+    """A file's text; warns if it is in none of Unicode's encodings."""
+    content = path.read_bytes()
+    try:
+        return decoded(content)
+    except UnicodeDecodeError:
+        warn(f"{path} is not in UTF-8 and is read as Latin-1. Save it as UTF-8 if names are wrong.")
+        return content.decode("latin-1")
 
 
 def _parsed(text: str) -> Any:

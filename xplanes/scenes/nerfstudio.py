@@ -56,7 +56,6 @@ def _listed_splits(
     if all(names is None for names in listed.values()):
         return None
     places = {image: index for index, image in enumerate(listing.paths)}
-    owner: dict[int, str] = {}
     found: dict[str, list[int]] = {}
     files = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
     missing = []
@@ -73,19 +72,24 @@ def _listed_splits(
                 if PurePosixPath(name) not in files:  # Missing frames are reported already.
                     missing.append(f"{key}: {problem}")
                 continue
-            if image not in places:
-                raise SceneError(
-                    f"{path}: {key} names {name}, which is in no frame. Add the frame, or remove "
-                    "the name."
-                )
-            # Validation and test splits may share views.
-            other = owner.setdefault(places[image], key)
-            if other != key and "train_filenames" in (other, key):
-                raise SceneError(
-                    f"{path}: {name} is in {other} and in {key}. Views that are scored must not be "
-                    "trained on: take it out of one of them."
-                )
-            found.setdefault(split, []).append(places[image])
+            if image in places:
+                found.setdefault(split, []).append(places[image])
+            else:
+                missing.append(f"{key}: {path}: {name} is in no frame.")
     if missing:
         warn(f"{len(missing)} names in lists of splits are left out:\n{first_of(missing)}")
-    return {split: sorted(set(chosen)) for split, chosen in found.items()}
+    splits = {split: sorted(set(chosen)) for split, chosen in found.items()}
+    _warn_of_shared_views(path, splits)
+    return splits
+
+
+def _warn_of_shared_views(path: Path, splits: Mapping[str, Sequence[int]]) -> None:
+    """Warn if views are trained on and scored; validation and test may share views."""
+    for split in SPLITS[1:]:
+        scored = splits.get(split, ())
+        if shared := set(scored) & set(splits.get("train", ())):
+            warn(
+                f"{path}: {len(shared)} of {len(scored)} views of {split}_filenames are in "
+                "train_filenames as well: they are trained on, so scores on them say nothing of "
+                "new views. Remove both lists to hold out every eighth frame."
+            )

@@ -125,16 +125,12 @@ def test_time_planes_wait_as_long_as_light_that_passes_the_cube_costs():
     assert priceless.rate_of("time", 150, 0.1) == priceless.rate_of("space", 150, 0.1)
 
 
-def test_large_views_are_few_and_surroundings_wait_after_the_first_step():
-    at = [0.0, 0.05, 0.1, 0.7]
+def test_large_views_are_few():
     views = scene("white").splits["train"]
-    many = 200_000 // (views.height * views.width)
-    assert affordable(at, 1.0, views, surrounded=True) == ([0.0, 0.1, 0.7], many)
-    assert affordable(at, 1.0, views, surrounded=False) == (at, many)
-    large = SimpleNamespace(height=400, width=500)
-    assert affordable(at, 1.0, large, surrounded=False) == (at, 2)  # pyright: ignore
+    assert affordable(1.0, views) == 200_000 // (views.height * views.width)
+    assert affordable(1.0, SimpleNamespace(height=400, width=500)) == 2  # pyright: ignore
     for limit in (7, 1, 0.5):
-        assert affordable(at, limit, views, surrounded=True) == (at, limit)
+        assert affordable(limit, views) == limit
 
 
 @pytest.mark.parametrize(("kind", "pruned"), [("world", 40), ("white", 20)])

@@ -95,8 +95,7 @@ def estimated(
     final = data.scene.splits[data.test_split]
     views = data.scene.splits[data.validation_split or data.test_split]
     at = experiment.callbacks.get("evaluation", {}).get("at", [])
-    limit = trainer.get("limit_val_batches", 1.0)
-    at, limit = affordable(at, limit, views, data.scene.is_surrounded)
+    limit = affordable(trainer.get("limit_val_batches", 1.0), views)
     count = scored_views(limit, len(views))
     pixels = views.height * views.width * count
     steps_at = [share * train / expected.step if share else 0.0 for share in {*at, 1.0}]

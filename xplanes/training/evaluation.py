@@ -26,32 +26,20 @@ SHOWN = 4
 ROW, LEAST_VIEWS = 200_000, 2
 """Pixels that a row of the curve scores by default, in at least so many views."""
 
-FIRST_SHARE = 0.1
-"""Default in scenes with surroundings: least share of the budget above 0."""
-
 CURVE = ("seconds", "step", "split", "psnr", "ssim")
 """Columns of curve.csv."""
 
 
-def affordable(
-    at: Sequence[float], limit: float, views: Views, surrounded: bool
-) -> tuple[list[float], int | float]:
-    """Shares of the budget at which to evaluate, and limit on the number of views.
-
-    Before empty space is pruned, a large view takes seconds to render: by default a row of the
-    curve scores few of them. In scenes with surroundings the whole cube may be occupied until
-    then, and no row is scored between step 0 and `FIRST_SHARE`.
+def affordable(limit: float, views: Views) -> int | float:
+    """Limit on the number of views in a row of the curve: by default few if they are large.
 
     Args:
-        at: Shares of the budget at which to evaluate.
         limit: ``trainer.limit_val_batches``; 1.0 for the default.
         views: Validation views.
-        surrounded: Whether the scene has surroundings.
     """
     if limit != 1.0 or isinstance(limit, int):
-        return list(at), limit
-    shares = [share for share in at if share == 0 or share >= FIRST_SHARE or not surrounded]
-    return shares, max(LEAST_VIEWS, ROW // (views.height * views.width))
+        return limit
+    return max(LEAST_VIEWS, ROW // (views.height * views.width))
 
 
 class Evaluation(Callback):
@@ -86,9 +74,7 @@ class Evaluation(Callback):
             data: Any = getattr(trainer, "datamodule", None)
             if isinstance(data, SceneDataModule):
                 views = data.read_split(data.validation_split or data.test_split)
-                self.at, trainer.limit_val_batches = affordable(
-                    self.at, trainer.limit_val_batches, views, data.scene.is_surrounded
-                )
+                trainer.limit_val_batches = affordable(trainer.limit_val_batches, views)
             trainer.check_val_every_n_epoch = None
             trainer.num_sanity_val_steps = float("inf") if 0 in self.at else 0
 

@@ -449,11 +449,11 @@ class PretrainingBatches:
 
         Points much closer to the surface than one texel carry little information.
         """
-        shape = self.objects, TRIES * self.near
+        shape = self.objects, self.near * TRIES
         tries = torch.randint(SURFACE, shape, generator=random, device=self.pool.device)
         apart = _take(record["points"], tries).float() - _take(record["surface"], tries).float()
-        far = apart.square().sum(dim=-1).unflatten(1, (TRIES, self.near))
-        return tries.unflatten(1, (TRIES, self.near)).gather(1, far.argmax(1, keepdim=True))[:, 0]
+        best = apart.square().sum(dim=-1).unflatten(1, (self.near, TRIES)).argmax(dim=2)
+        return tries.gather(1, TRIES * torch.arange(self.near, device=best.device) + best)
 
     def _turn(self, poses: Tensor) -> Tensor:
         """Rotation and scale from objects' world to the model's frame. [B, 4, 4] -> [B, 3, 3]"""

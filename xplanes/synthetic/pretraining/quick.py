@@ -12,14 +12,12 @@ from xplanes.synthetic.pretraining.losses import triplane_logits
 from xplanes.synthetic.pretraining.pool import FOCAL, Pool
 from xplanes.synthetic.pretraining.render import render_view
 
-_USED = ("pictures", "poses", "points", "inside")
-
 
 class QuickLook:
     """Scores of the first objects of a held-out pool, reconstructed from their first view.
 
     Args:
-        pool: The objects.
+        pool: The objects, on the model's device.
         count: Number of objects.
     """
 
@@ -29,11 +27,11 @@ class QuickLook:
     @torch.no_grad()
     def scores(self, model: OpenLRM) -> dict[str, float]:
         """IoU at the stored points, and PSNR (dB) of the input view and of the second view."""
-        device = model.position.device
         found: dict[str, list[float]] = {"iou": [], "psnr_input": [], "psnr_novel": []}
-        camera = canonical_vector(model.view)[None].to(device)
+        camera = canonical_vector(model.view)[None].to(self.pool.device)
         for number in range(self.count):
-            record = {name: torch.tensor(self.pool[number][name], device=device) for name in _USED}
+            records = self.pool.records(torch.tensor([number]))
+            record = {name: values[0] for name, values in records.items()}
             pictures = record["pictures"][..., :3].float() / 255
             planes = model.triplanes(pictures[:1].permute(0, 3, 1, 2), camera)
             turn = world_to_model(record["poses"][0], model)
@@ -52,9 +50,8 @@ class QuickLook:
 def world_to_model(source: Tensor, model: LRM) -> Tensor:
     """Scale and rotation from world to model frame, for a source camera. [4, 4] -> [3, 3]"""
     scale = model.view.distance / CAMERA_DISTANCE
-    return (
-        scale * model.view.rotation_matrix().to(source.device) @ source[:3, :3].T.double()
-    ).float()
+    turn = scale * model.view.rotation_matrix().to(source.device)
+    return (turn @ source[:3, :3].T.double()).float()
 
 
 def model_pose(pose: Tensor, turn: Tensor) -> Tensor:

@@ -163,9 +163,7 @@ def _pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str]
     checkpoint = str(last) if last.is_file() else None
     with interrupt.exits():
         trainer.fit(module, loader, ckpt_path=checkpoint, weights_only=True)
-    return export(
-        module.average.cpu(), published_sizes(config.model, FOCAL), run, config.model.name
-    )
+    return export(module.average, published_sizes(config.model, FOCAL), run, config.model.name)
 
 
 def assemble(
@@ -188,6 +186,7 @@ def assemble(
         HELD_OUT_SEEDS[: shards * SHARD],
         views=pool.views,
         side=side,
+        device=device,
         announce=announce,
     )
     sizes = parse_config(published_sizes(config.model, FOCAL))

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from tests.refusals import assert_refused
-from xplanes.decomposition import ORIENTATIONS, decompose, robust_pca
+from xplanes.decomposition import decompose, robust_pca
+from xplanes.fields.xplanes import SPACE_PLANES
 
 
 def sequence(frames=6, channels=4, height=8, width=10, seed=0):
@@ -19,7 +20,7 @@ def sequence(frames=6, channels=4, height=8, width=10, seed=0):
 def test_each_orientation_is_its_own_matrix():
     triplanes = sequence()
     parts = decompose(triplanes, sparsity_weight="auto")
-    for index, name in enumerate(ORIENTATIONS):
+    for index, name in enumerate(SPACE_PLANES):
         alone = robust_pca(triplanes[:, index].reshape(6, -1).mT, sparsity_weight="auto")
         low = alone.low_rank.mT.reshape(6, 4, 8, 10)
         assert torch.allclose(parts.low_rank[:, index], low, atol=1e-5)

@@ -83,6 +83,7 @@ def test_fog_has_time_to_clear_by_itself(monkeypatch):
     monkeypatch.setattr(collapse, "WINDOW", 1)
     watch, module = CollapseWatch(restarts=0), Mock(spec=RadianceModule)
     module.tally, module.between_updates = SimpleNamespace(last=FOGGY), True
+    module.restarts = 0
     for step, foggy in ((collapse.FIRST_FOG, False), (collapse.FIRST_FOG + 1, True)):
         trainer = SimpleNamespace(global_step=step, world_size=1)
         watch.on_train_batch_end(trainer, module, None, None, 0)

@@ -2,7 +2,6 @@
 
 from xplanes.decomposition.conversion import space_planes, time_planes
 from xplanes.decomposition.rpca import (
-    ORIENTATIONS,
     Decomposition,
     RobustPCA,
     decompose,
@@ -11,7 +10,6 @@ from xplanes.decomposition.rpca import (
 from xplanes.decomposition.sparse_loss import sparse_product_loss, unexplained_energy
 
 __all__ = [
-    "ORIENTATIONS",
     "Decomposition",
     "RobustPCA",
     "decompose",

@@ -18,8 +18,8 @@ from xplanes.decomposition.admm import (
     block_rows,
     minimise,
 )
+from xplanes.fields.xplanes import SPACE_PLANES
 
-ORIENTATIONS = ("xy", "xz", "yz")
 METHODS = tuple(SCHEDULES)
 SCALES = ("rms", "none")
 
@@ -301,7 +301,7 @@ def decompose(triplanes: Tensor, **options: Any) -> Decomposition:
     low_rank = torch.empty(triplanes.shape, dtype=kind, device=triplanes.device)
     sparse = torch.empty_like(low_rank)
     reports = {}
-    for index, name in enumerate(ORIENTATIONS):
+    for index, name in enumerate(SPACE_PLANES):
         parts = low_rank[:, index].flatten(1).mT, sparse[:, index].flatten(1).mT
         matrix = triplanes[:, index].flatten(1).mT
         reports[name] = robust_pca(matrix, out=parts, **options).report()

@@ -36,7 +36,6 @@ class CollapseWatch(Callback):
         restarts: Maximum number of re-initialisations; 0 for a warning only.
 
     Attributes:
-        restarted: Steps at which the field was re-initialised.
         collapsed: Description of the last collapse; empty if there was none.
     """
 
@@ -44,8 +43,8 @@ class CollapseWatch(Callback):
         if restarts < 0:
             raise ConfigError(f"restarts={restarts}: must be 0 or more")
         self.restarts = restarts
-        self.restarted: list[int] = []
         self.collapsed = ""
+        self._since = 0
         self._seen: list[tuple[float, float]] = []
 
     def on_train_batch_end(
@@ -56,14 +55,14 @@ class CollapseWatch(Callback):
         self._seen.append((last.get("foreground", math.nan), last.get("background", math.nan)))
         if len(self._seen) < WINDOW or not pl_module.between_updates:
             return
-        age = trainer.global_step - (self.restarted[-1] if self.restarted else 0)
+        age = trainer.global_step - self._since
         found = verdict(self._seen, fog=age > FIRST_FOG)
         self._seen = []
         if not found:
             self.collapsed = ""
             return
         alone = trainer.world_size == 1
-        if len(self.restarted) < self.restarts and alone and pl_module.can_restart:
+        if pl_module.restarts < self.restarts and alone and pl_module.can_restart:
             logger.warning(
                 "%s at step %d: it is initialised again, with another seed and stronger "
                 "supervision of opacity",
@@ -71,7 +70,7 @@ class CollapseWatch(Callback):
                 trainer.global_step,
             )
             pl_module.restart()
-            self.restarted.append(trainer.global_step)
+            self._since = trainer.global_step
         elif not self.collapsed:
             self.collapsed = found
             logger.warning(
@@ -82,14 +81,10 @@ class CollapseWatch(Callback):
             )
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "restarted": self.restarted,
-            "collapsed": self.collapsed,
-            "seen": self._seen,
-        }
+        return {"since": self._since, "collapsed": self.collapsed, "seen": self._seen}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.restarted, self.collapsed = list(state_dict["restarted"]), state_dict["collapsed"]
+        self._since, self.collapsed = state_dict.get("since", 0), state_dict["collapsed"]
         self._seen = [tuple(pair) for pair in state_dict["seen"]]
 
 

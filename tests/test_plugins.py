@@ -12,15 +12,17 @@ import yaml
 
 from tests.training.runs import metrics, small_config
 from xplanes import RadianceModule, SceneDataModule, __version__
+from xplanes.components import build, plugins
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.fields.base import RadianceField
 from xplanes.run import run
+from xplanes.scenes.source import SceneSettings
 from xplanes.tools.runs import load_run
 
 BLOB = {
-    "_target_": "tests.plugins.gaussian_blob.BlobSettings",
+    "_target_": "tests.plugins.blob.BlobSettings",
     "name": "blob",
     "width": 0.4,
     "learning_rate": 0.1,
@@ -32,7 +34,7 @@ SAMPLER = {
     "samples": 12,
 }
 DATA = {
-    "_target_": "tests.plugins.shell_format.DiscSettings",
+    "_target_": "tests.plugins.disc_format.DiscSettings",
     "name": "disc",
     "scene": "disc",
     "count": 6,
@@ -93,7 +95,7 @@ def test_a_recipe_reaches_a_model_of_ones_own_or_names_itself(tmp_path):
 
 
 def test_data_of_ones_own_is_composed_in_python():
-    own = ["data._target_=tests.plugins.shell_format.DiscSettings", "+data.count=6"]
+    own = ["data._target_=tests.plugins.disc_format.DiscSettings", "+data.count=6"]
     own += [f"~data.{name}" for name in ("seed", "train_views", "test_views", "val_views")]
     data = SceneDataModule.compose("plugins=[tests.plugins]", *own, "data.scene=disc")
     assert len(data.scene.splits["train"]) == 6
@@ -124,7 +126,7 @@ def test_a_run_of_somebody_else_names_no_classes_by_itself(config, tmp_path):
         ("tests.plugins.opacity_loss.OpacityLoss", "must be a class derived from .*ModelSettings"),
         ("tests.plugins.opacity_loss.Nothing", "there is no such class"),
         ("xplanes.models.base.torch", "must be a class derived from"),
-        ("tests.plugins.gaussian_blob.RadianceField", "must be a class derived from"),
+        ("tests.plugins.blob.RadianceField", "must be a class derived from"),
     ],
 )
 def test_classes_that_may_not_stand_there_are_refused(config, tmp_path, target, words):
@@ -229,6 +231,25 @@ def test_the_model_of_the_docs_trains(small_model, tmp_path):
     assert (field.precision, field.outline) == ("32", "MLPField")
 
 
+def test_the_variant_and_the_loss_of_the_docs_train(example, tmp_path):
+    loss = ["plugins=[my_package,tests.plugins]", "lrm=none", "trainer.max_steps=3"]
+    (command,) = re.findall(r"^    python train.py .*losses.*", PAGE.read_text(), re.MULTILINE)
+    loss += [word for word in command.split() if word.startswith("+losses")]
+    own = example("A variant of X-Planes", "model", "scaled", *loss)
+    run(own, tmp_path / "run", [], resume=False)
+    module = load_run(tmp_path / "run", plugins=["my_package", "tests.plugins"]).module
+    assert float(module.field.scale.detach()) != 1
+    assert "alpha" in module.method.losses
+
+
+def test_the_settings_of_the_docs_data_format_are_complete(scenes):
+    text = PAGE.read_text(encoding="utf-8").split("### A data format\n")[1].split("\n### ")[0]
+    (block,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    with plugins(["tests.plugins"]):
+        scene = build(yaml.safe_load(block), SceneSettings, "data").load(("train",))
+    assert len(scene.splits["train"]) == 6
+
+
 @pytest.mark.parametrize(
     ("groups", "words"),
     [
@@ -238,6 +259,10 @@ def test_the_model_of_the_docs_trains(small_model, tmp_path):
         (
             [{"params": [], "lr": 0.1, "name": "mlp", "learning_rate": 1}],
             "Adam takes no 'learning_rate', which the group mlp has; it takes lr, betas",
+        ),
+        (
+            [{"params": [], "lr": 0.1, "name": "mlp"}],
+            "no group has layers.0.weight of MLPField, which would never be trained; add it",
         ),
     ],
 )

@@ -99,9 +99,10 @@ class Settings:
                 near = difflib.get_close_matches(name, known, n=3)
                 hint = f". Did you mean {' or '.join(near)}?" if near else ""
                 raise ConfigError(f"{name}: there is no such setting{hint}")
-        for name, entry in known.items():
-            if name not in given and entry.default is entry.default_factory is MISSING:
-                raise ConfigError(f"{name}: it is not set")
+        needed = (n for n, e in known.items() if e.default is e.default_factory is MISSING)
+        if missing := [name for name in needed if name not in given]:
+            verb = "it is" if len(missing) == 1 else "they are"
+            raise ConfigError(f"{', '.join(missing)}: {verb} not set")
 
     def plain(self) -> dict[str, Any]:
         """The settings as builtins, with the class as ``_target_``."""

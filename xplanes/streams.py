@@ -29,8 +29,8 @@ class Stream(IntEnum):
     """Points at which a triplane's occupancy grid is filled for its turntable video."""
     FILL = 1_000_081
     """Points at which the occupancy grid of an initialised field is filled."""
-    BASELINE_FIELD = 1_000_099
-    """Initial values of the baselines' fields."""
+    FIELD = 1_000_099
+    """Initial values of other fields."""
     SAMPLER = 1_000_117
     """Initial values of samplers that learn."""
     NEARBY = 1_000_151

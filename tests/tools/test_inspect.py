@@ -518,7 +518,7 @@ def test_a_format_of_ones_own_joins(tmp_path, monkeypatch):
     base = compose_plain("train", [])["data"]
     dropped = ("seed", "train_views", "test_views", "val_views", "_target_")
     node = {name: value for name, value in base.items() if name not in dropped}
-    node |= {"_target_": "tests.plugins.shell_format.DiscSettings", "name": "disc", "count": 6}
+    node |= {"_target_": "tests.plugins.disc_format.DiscSettings", "name": "disc", "count": 6}
     (conf / "disc.yaml").write_text(json.dumps(node))
     folder = tmp_path / "shells"
     folder.mkdir()

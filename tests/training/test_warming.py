@@ -25,4 +25,4 @@ def test_the_first_ray_asks_the_field_and_is_counted(monkeypatch, capsys):
         warming.render_one_ray(field, GridRenderer(OccupancyGrid(4, 1, step=DIAGONAL / 8), 8))
     assert sum(map(len, asked)) > 0
     assert warm_up.seconds - before >= 0.4
-    assert capsys.readouterr().out.count("compiling the inner loops") == 1
+    assert capsys.readouterr().out.count("loading the inner loops") == 1

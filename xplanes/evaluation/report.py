@@ -265,7 +265,8 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
     kept = "checkpoints/last.ckpt  " if (run / "checkpoints" / LAST).is_file() else ""
     steps = [*curves, f"xplanes render {place}{named}", resume_command(run) + more]
     steps = steps if kept else curves
-    warm_up = f"compiling {seconds['warm_up']:.1f} s · " if seconds["warm_up"] >= 1 else ""
+    warm = seconds["warm_up"]
+    warm_up = f"loading and compiling {warm:.1f} s · " if warm >= 1 else ""
     moved = []
     if (cameras := metrics.get("cameras")) is not None:
         moved.append(

@@ -20,7 +20,8 @@ _DENSITIES: dict[DensityActivation, Callable[[Tensor], Tensor]] = {
     "softplus": F.softplus,
     "exp": lambda logits: logits.clamp_max(MOST_EXPONENT).exp(),
 }
-"""To add an activation of the density, add it here and to `DensityActivation`."""
+"""To add an activation of the density, add it here, to `DensityActivation`, to its test and to the
+reader of exported planes in docs/recipes.md; then run docs/generate.py."""
 
 ROWS = 256
 """On the CPU, matrices are padded to a multiple of this many rows, or of more if they are long.

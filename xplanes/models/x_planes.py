@@ -129,7 +129,7 @@ class XPlanesSettings(ModelSettings):
 
     takes: ClassVar = "planes"
     devices: ClassVar[int | None] = None
-    field_class: ClassVar = XPlanes
+    field_class: ClassVar[type[XPlanes]] = XPlanes
 
     plane_set: Literal["six", "nine", "three"]  # Planes; three: a static field.
     resolution: Count  # Texels along each space axis.
@@ -242,7 +242,9 @@ class XPlanesSettings(ModelSettings):
                 if background is None:  # White fog in front of a learnt background would fade away.
                     decoder.layers[-1].bias[1:] += options.colour_bias  # type: ignore[index]
         decoder.requires_grad_(not options.freeze)
-        return XPlanes(planes=planes, decoder=decoder, plane_set=plane_set, background=background)
+        return self.field_class(
+            planes=planes, decoder=decoder, plane_set=plane_set, background=background
+        )
 
 
 class XPlanesModel(Model):

@@ -18,7 +18,7 @@ PATIENCE = 3.0
 @cache
 def say_why() -> None:
     """Print the message once per process."""
-    print(f"compiling the inner loops: about {COMPILING} s ...", flush=True)
+    print(f"loading the inner loops; compiling them takes about {COMPILING} s ...", flush=True)
 
 
 @contextmanager

@@ -293,3 +293,11 @@ def require_groups(model: Model, sampler: Sampler) -> None:
                 f"{place}: {type(optimizer).__name__} takes no {key!r}, which the group {name} "
                 f"has; it takes {', '.join(optimizer.defaults)}"
             )
+    trained = {id(parameter) for group in groups for parameter in group["params"]}
+    for part in (model.field, *sampler.parts.values()):
+        for name, parameter in part.named_parameters():
+            if parameter.requires_grad and id(parameter) not in trained:
+                raise ConfigError(
+                    f"{place}: no group has {name} of {type(part).__name__}, which would never be "
+                    "trained; add it to a group, or call its requires_grad_(False)"
+                )

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 
 def logs_now(trainer: Trainer) -> bool:
-    """Whether the last batch is to be logged."""
-    every = trainer.log_every_n_steps  # type: ignore[attr-defined]
+    """Whether the last batch is to be logged: it ends a step that Lightning logs."""
+    every = trainer.log_every_n_steps * trainer.accumulate_grad_batches  # type: ignore[attr-defined]
     # The Trainer's own count: it begins at 0 even if the module was loaded.
     batch = trainer.fit_loop.epoch_loop.total_batch_idx + 1
     return bool(every and not batch % every and trainer.loggers)

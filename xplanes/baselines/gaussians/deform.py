@@ -39,7 +39,7 @@ class DeformedGaussiansSettings(GaussiansSettings):
             )
 
     def build(self, site: Site, initial: InitialValues | None = None) -> "DeformedGaussiansModel":
-        with initial_values(site.seed, Stream.BASELINE_FIELD):
+        with initial_values(site.seed, Stream.FIELD):
             field = DeformedGaussians(
                 self.first_points(site, initial),
                 degree=self.degree,

@@ -55,7 +55,7 @@ class HexPlaneGaussiansSettings(GaussiansSettings):
             raise ConfigError("scales=[]: must be one or more numbers above 0")
 
     def build(self, site: Site, initial: InitialValues | None = None) -> "HexPlaneGaussiansModel":
-        with initial_values(site.seed, Stream.BASELINE_FIELD):
+        with initial_values(site.seed, Stream.FIELD):
             planes = None
             if site.moves:
                 rows = self.time_resolution or site.time_rows

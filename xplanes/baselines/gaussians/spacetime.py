@@ -24,7 +24,7 @@ class SpacetimeGaussiansSettings(GaussiansSettings):
     spin_lr: Positive  # Learning rate of the rotation polynomials.
 
     def build(self, site: Site, initial: InitialValues | None = None) -> "SpacetimeGaussiansModel":
-        with initial_values(site.seed, Stream.BASELINE_FIELD):
+        with initial_values(site.seed, Stream.FIELD):
             field = SpacetimeGaussians(
                 self.first_points(site, initial),
                 degree=self.degree,

@@ -77,7 +77,7 @@ class KPlanesSettings(ModelSettings):
 
     def build(self, site: Site, initial: InitialValues | None = None) -> "KPlanesModel":
         decoder = {"hybrid": HybridDecoder, "explicit": ExplicitDecoder}[self.variant]
-        with initial_values(site.seed, Stream.BASELINE_FIELD):
+        with initial_values(site.seed, Stream.FIELD):
             products = PlaneProducts(
                 self.channels,
                 self.resolution,

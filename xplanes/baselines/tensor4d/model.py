@@ -58,7 +58,7 @@ class Tensor4DDensitySettings(ModelSettings):
         return self.point_octaves, self.time_octaves, self.direction_octaves
 
     def build(self, site: Site, initial: InitialValues | None = None) -> Model:
-        with initial_values(site.seed, Stream.BASELINE_FIELD):
+        with initial_values(site.seed, Stream.FIELD):
             field = Tensor4DDensity(
                 self.planes(DYNAMIC if site.moves else STATIC, fine=True),
                 self.width,
@@ -97,7 +97,7 @@ class Tensor4DSettings(Tensor4DDensitySettings):
             )
 
     def build(self, site: Site, initial: InitialValues | None = None) -> Model:
-        with initial_values(site.seed, Stream.BASELINE_FIELD):
+        with initial_values(site.seed, Stream.FIELD):
             field = Tensor4D(
                 self.planes(STATIC, fine=True),
                 self.planes(DYNAMIC, fine=False) if site.moves else None,

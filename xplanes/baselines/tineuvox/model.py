@@ -84,7 +84,7 @@ class TiNeuVoxSettings(ModelSettings):
 
     def build(self, site: Site, initial: InitialValues | None = None) -> "TiNeuVoxModel":
         assert site.bounds is not None
-        with initial_values(site.seed, Stream.BASELINE_FIELD):
+        with initial_values(site.seed, Stream.FIELD):
             field = TiNeuVox(
                 site.bounds,
                 self.resolution,

@@ -141,7 +141,8 @@ def _recorded(job: Job, overrides: list[str], *, resume: bool, began: float | No
             record.end("finished")
         except KeyboardInterrupt:
             record.end("interrupted")
-            say(f"\nstopped. Resume with: {resume_command(folder)}")
+            step = job.trainer.global_step
+            say(f"\nstopped after step {step}. Resume with: {resume_command(folder)}")
             raise
         except BaseException as error:
             logger.exception("failed")
@@ -196,16 +197,19 @@ def train(
 
     # Training
     warm_up_loops(module, data, device)
+    checkpoint = find_resumable(folder / "checkpoints") if resume else None
     if record is not None:
         hardware = torch.cuda.get_device_name() if device.type == "cuda" else "cpu"
         files = {name: list(views.files) for name, views in scene.splits.items()}
         record.note(device=hardware, precision=module.field.precision, files=files)
         expected = estimate(module, data)
-        text = header(experiment, folder, data, module, overrides, expected, record.seconds)
+        text = header(
+            experiment, folder, data, module, overrides, expected, record.seconds, checkpoint
+        )
         logger.info("\n%s", text)
         say(text + "\n")
         write_pictures(trainer, found.pictures, log=not resume)
-    trainer.train(module, data, find_resumable(folder / "checkpoints") if resume else None)
+    trainer.train(module, data, checkpoint)
 
     # Scores
     began = time.perf_counter()

@@ -21,8 +21,8 @@ from xplanes.rendering.pictures import write_png
 from xplanes.rendering.refining import RefiningSampler
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Views
-from xplanes.training.checkpoints import LAST
-from xplanes.training.clock import training_seconds
+from xplanes.training.checkpoints import LAST, training_so_far
+from xplanes.training.clock import training_seconds, training_share
 from xplanes.training.evaluation import affordable, log_image
 from xplanes.training.fit import Estimate, Trainer
 from xplanes.training.module import RadianceModule
@@ -30,6 +30,12 @@ from xplanes.training.scores import ViewScore, blank_psnr, mean_colour, mean_sco
 
 LITTLE = 0.5
 """Gain in dB over images of background alone below which a run has learnt nothing."""
+
+LONG = 30.0
+"""Seconds of scores and images from which the header may say how to shorten them."""
+
+BUSY = 0.6
+"""CPU time per second of training on the CPU below which a run warns."""
 
 CLUTTERED = 0.2
 """Share of floaters above which a run warns; successful scenes have less than a tenth."""
@@ -43,8 +49,20 @@ def header(
     overrides: Sequence[str],
     expected: Estimate,
     spent: float,
+    checkpoint: Path | None = None,
 ) -> str:
-    """The lines printed before training: software, data, model, budget and expected time."""
+    """The lines printed before training: software, data, model, budget and expected time.
+
+    Args:
+        experiment: The settings.
+        run: The run directory.
+        data: The data.
+        module: The module, with its field.
+        overrides: Overrides from the command line.
+        expected: Expected durations.
+        spent: Seconds since the start of this process's part of the run.
+        checkpoint: The checkpoint from which training continues, if any.
+    """
     assert module.frame is not None
     assert module.initialisation is not None
     scene = data.scene
@@ -67,11 +85,13 @@ def header(
     limits = [f"{count} {unit}{'s' * (count != 1)}" for unit, count in budget.items()]
     if (seconds := trainer.get("max_seconds")) is not None:
         limits.append(f"{seconds:g} s")
+    done, trained = (0, 0.0) if checkpoint is None else training_so_far(checkpoint)
     lines = {
         "xplanes": f"{__version__} · torch {torch.__version__} · {device} · "
         f"{torch.get_num_threads()} threads · decoder {module.field.precision} · "
         f"{backend.name(device)}",
         "run": str(run),
+        **({"resumed": f"after step {done}, {trained:.0f} s of training"} if done else {}),
         "data": f"{experiment.data.name} {scene.name} · {counts} views · "
         f"{train.outline} · {size:.1f} MB{where} · {cube}",
         "model": f"{experiment.method.model.name} {module.field.outline} · "
@@ -79,26 +99,42 @@ def header(
         "from": module.initialisation.description,
         "samples": module.sampler.outline,
         "budget": " or ".join(limits) + ", whichever comes first" * (len(limits) > 1),
-        "estimate": estimated(experiment, data, expected, spent),
+        "estimate": estimated(experiment, data, expected, spent, done, trained),
         "changed": " ".join(overrides) or "(nothing)",
     }
     return "\n".join(f"{name:<9}{text}" for name, text in lines.items())
 
 
 def estimated(
-    experiment: Experiment, data: SceneDataModule, expected: Estimate, spent: float
+    experiment: Experiment,
+    data: SceneDataModule,
+    expected: Estimate,
+    spent: float,
+    done: int = 0,
+    trained: float = 0.0,
 ) -> str:
-    """The run's expected duration as text, ``spent`` seconds after its start."""
+    """The run's expected duration as text, ``spent`` seconds after its start.
+
+    Args:
+        experiment: The settings.
+        data: The data.
+        expected: Expected durations.
+        spent: Seconds so far.
+        done: Steps before a resume.
+        trained: Seconds of training before it.
+    """
     trainer = experiment.trainer
     steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
-    train = min(steps * expected.step, trainer.get("max_seconds") or math.inf)
+    seconds = trainer.get("max_seconds") or math.inf
+    train = max(0.0, min((steps - done) * expected.step, seconds - trained))
     final = data.scene.splits[data.test_split]
     views = data.scene.splits[data.validation_split or data.test_split]
     at = experiment.callbacks.get("evaluation", {}).get("at", [])
     limit = affordable(trainer.get("limit_val_batches", 1.0), views)
     count = scored_views(limit, len(views))
     pixels = views.height * views.width * count
-    steps_at = [share * train / expected.step if share else 0.0 for share in {*at, 1.0}]
+    whole = done + train / expected.step  # Evaluations before a resume are not repeated.
+    steps_at = [share * whole for share in {*at, 1.0} if not done or share * whole > done]
     images = sum(pixels * expected.ray(step) for step in steps_at)
     if final is not views or count < len(views):
         images += final.height * final.width * len(final) * expected.later_ray
@@ -107,7 +143,13 @@ def estimated(
     parts = f"{spent:.0f} s so far, {{}} of training, {images:.0f} s of scores and images"
     if train == math.inf:
         return parts.format("no end")
-    return f"{spent + train + images:.0f} s in all: {parts.format(f'{train:.0f} s')}"
+    text = f"{spent + train + images:.0f} s in all: {parts.format(f'{train:.0f} s')}"
+    if images > max(train, LONG):
+        text += (
+            "\n         scores and images take longer than training: media=false "
+            '"callbacks.evaluation.at=[1]" data.eval_views=4 shorten them'
+        )
+    return text
 
 
 def scored_views(limit: float, views: int) -> int:
@@ -151,6 +193,7 @@ def summary(
         "steps_skipped": module.tally.skipped,
         "restarts": module.restarts,
         "threads": torch.get_num_threads(),
+        "cpu_share": training_share(trainer),
         "loops": backend.name(device),
         "parameters": sum(p.numel() for p in module.parameters()),
         "peak_memory_bytes": device_memory(device),
@@ -252,6 +295,11 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             "or check the cameras and times; content that\n         is too thin or too fast for "
             "the views shows up as floaters as well"
         )
+    if experiment.device.type == "cpu" and (share := metrics["cpu_share"]) < BUSY:
+        warnings.append(
+            f"warning  training got {share:.1f} s of CPU time a second: other programs use this "
+            "machine, or a disk\n         is slow; an idle machine trains further in the same time"
+        )
     place = shlex.quote(str(run))
     named = "".join(f" --plugin {name}" for name in experiment.config.get("plugins") or [])
     curves = [f"tensorboard --logdir {place}"] * any(run.rglob("events.out.tfevents.*"))
@@ -265,8 +313,13 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
     kept = "checkpoints/last.ckpt  " if (run / "checkpoints" / LAST).is_file() else ""
     steps = [*curves, f"xplanes render {place}{named}", resume_command(run) + more]
     steps = steps if kept else curves
-    warm = seconds["warm_up"]
-    warm_up = f"loading and compiling {warm:.1f} s · " if warm >= 1 else ""
+    more_time = {
+        "reading the scene": seconds["load"],
+        "compiled loops": seconds["warm_up"],
+        "scoring": seconds["evaluate"],
+        "start, checkpoints and video": seconds["other"],
+    }
+    parts = [f"{name} {value:.1f} s" for name, value in more_time.items() if value >= 1]
     moved = []
     if (cameras := metrics.get("cameras")) is not None:
         moved.append(
@@ -279,8 +332,8 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
         *warnings,
         *moved,
         f"time     prepare {sum(seconds['prepare'].values()):.1f} s + train "
-        f"{seconds['train']:.1f} s · {warm_up}scoring {seconds['evaluate']:.1f} s · "
-        f"{seconds['total']:.1f} s in all · {metrics['rays_per_second'] / 1000:.1f}k rays/s",
+        f"{seconds['train']:.1f} s, {metrics['rays_per_second'] / 1000:.1f}k rays/s",
+        f"         {seconds['total']:.1f} s in all; {', '.join(parts)}",
         *([skips] if metrics["samples_per_ray"] else []),
         f"memory   {metrics['peak_memory_bytes'] / 2**30:.1f} GB at its peak",
         f"wrote    {run}",

@@ -53,10 +53,13 @@ class BundledLRMSettings(ImageLRMSettings):
             model, path = load_bundled(self.bundled)
         else:
             own = Path(self.weights)
-            if own.suffix != ".safetensors" or not own.is_file():
+            if not own.is_file():
+                raise LRMError(f"lrm.weights={own}: there is no such file")
+            if own.suffix != ".safetensors":
                 raise LRMError(
                     f"{own} is not a .safetensors file: name one that xplanes "
-                    "pretrain-lrm wrote, with its .json beside it"
+                    "pretrain-lrm wrote, with its .json beside it, or say which published model "
+                    f"the weights belong to (lrm=large lrm.weights={own})"
                 )
             model, path = load_bundled(own.stem, own.parent)
         return loaded(model, path, began)
@@ -122,7 +125,13 @@ class AutoInitialiser(LRMInitialiser):
     def initialise(self, method: Method, place: Place) -> Initialisation:
         scene, wanted = place.scene, method.preparation.fixed_view
         if wanted == "auto" and scene.lrm_views is None and given_video(scene, wanted) is None:
-            words = "random initialisation: no video of a fixed camera for an LRM"
+            words = "no video of a fixed camera for an LRM"
+            if scene.video is not None:
+                words = (
+                    "the images of the fixed camera have no silhouettes for an LRM "
+                    "(preparation.fixed_view=video takes them all the same)"
+                )
+            words = f"random initialisation: {words}"
             return Initialisation(method.model, place.frame, description=words)
         return super().initialise(method, place)
 

@@ -54,6 +54,41 @@ class StepBar(ProgressBar):
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._shown and trainer.is_global_zero:
             self._write(self.line(trainer, pl_module), last=True)
+            self._width = 0
+
+    def on_validation_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        counts = trainer.num_sanity_val_batches if trainer.sanity_checking else None
+        self._scored(trainer, batch_idx + 1, counts or trainer.num_val_batches)
+
+    def on_test_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        self._scored(trainer, batch_idx + 1, trainer.num_test_batches)
+
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self.live and self._width:
+            self.stream.write("\r" + " " * self._width + "\r")
+            self._width = 0
+
+    def _scored(self, trainer: Trainer, done: int, counts: Any) -> None:
+        if not self._shown or not trainer.is_global_zero or time.monotonic() < self._due:
+            return
+        self._due = time.monotonic() + self._every
+        self._write(f"scoring: {done} of {sum(map(int, counts))} views")
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
@@ -68,7 +103,6 @@ class StepBar(ProgressBar):
         clock = find_callback(trainer, TrainingClock)
         most = None if clock is None else clock.max_seconds
         rate = (rays - self._began[1]) / max(seconds - self._began[0], 1e-9)
-        left = seconds * (1 / max(module.progress, 1e-6) - 1)
         parts = [
             f"step {trainer.global_step}" + f"/{trainer.max_steps}" * (trainer.max_steps >= 0),
             f"{seconds:.0f}/{most:.0f} s" if most else f"{seconds:.0f} s",
@@ -80,7 +114,9 @@ class StepBar(ProgressBar):
         for name, value in module.tally.last.items():
             if name.endswith("/psnr"):
                 parts.append(f"{name.replace('/', ' ')} {value:.2f}")
-        parts.append(f"{int(left) // 60}:{int(left) % 60:02d} left")
+        if module.progress < 1:
+            left = seconds * (1 / max(module.progress, 1e-6) - 1)
+            parts.append(f"{int(left) // 60}:{int(left) % 60:02d} of training left")
         return "  ".join(parts)
 
     def _write(self, line: str, last: bool = False) -> None:

@@ -17,7 +17,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from xplanes.errors import ConfigError
 from xplanes.files import replacing, stand_in
-from xplanes.training.clock import off_clock
+from xplanes.training.clock import TrainingClock, off_clock
 from xplanes.training.diagnosis import require_finite
 from xplanes.training.interrupt import Stopped
 from xplanes.training.module import RadianceModule
@@ -214,3 +214,14 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
             f"{path} cannot be read ({type(error).__name__}: {str(error).split('. ')[0]}): it is "
             f"damaged; try {BEST if path.name == LAST else LAST} beside it"
         ) from error
+
+
+def training_so_far(path: Path) -> tuple[int, float]:
+    """Steps and seconds of the training clock in a checkpoint.
+
+    Raises:
+        ConfigError: If it cannot be read.
+    """
+    content = load_checkpoint(path)
+    clock = content.get("callbacks", {}).get(TrainingClock.__qualname__, {})
+    return content["global_step"], clock.get("seconds", 0.0)

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
@@ -36,12 +37,14 @@ class TrainingClock(Callback):
 
     Attributes:
         seconds: Seconds counted so far, including those before a resume.
+        counted: Wall-clock seconds and CPU seconds counted in this process. float64 [2]
     """
 
     def __init__(self, max_seconds: float | None = None) -> None:
         self.max_seconds = max_seconds
         self.seconds = 0.0
-        self._mark = 0.0
+        self.counted = np.zeros(2)
+        self._mark = np.zeros(2)
         self._device = torch.device("cpu")
 
     @property
@@ -53,15 +56,16 @@ class TrainingClock(Callback):
         if self.max_seconds is not None and self.seconds >= self.max_seconds:
             trainer.should_stop = True
         self._device = pl_module.device
-        self._mark = time.perf_counter()
+        self._mark = _now()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         if not agreeing(trainer):
             return
-        now = time.perf_counter()
-        spent = now - self._mark
+        now = _now()
+        self.counted += now - self._mark
+        spent = float((now - self._mark)[0])
         if trainer.world_size > 1:
             # All ranks must stop at the same step and use the same learning rate.
             shared = torch.tensor(spent, device=pl_module.device)
@@ -77,32 +81,38 @@ class TrainingClock(Callback):
     def off(self) -> Iterator[None]:
         """Do not count the time of the block."""
         synchronize(self._device)
-        began = time.perf_counter()
+        began = _now()
         try:
             yield
         finally:
             synchronize(self._device)
-            self._mark += time.perf_counter() - began
+            self._mark += _now() - began
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         synchronize(self._device)
-        self._left = time.perf_counter()
+        self._left = _now()
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         synchronize(self._device)
-        self._mark += time.perf_counter() - self._left
+        self._mark += _now() - self._left
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._device.type != "cpu" or trainer.world_size > 1:
             synchronize(self._device)
-            self.seconds += time.perf_counter() - self._mark
-            self._mark = time.perf_counter()
+            now = _now()
+            self.seconds += float((now - self._mark)[0])
+            self._mark = now
 
     def state_dict(self) -> dict[str, Any]:
         return {"seconds": self.seconds}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.seconds = state_dict["seconds"]
+
+
+def _now() -> np.ndarray:
+    """Wall-clock time and this process's CPU time in seconds. [2]"""
+    return np.array([time.perf_counter(), time.process_time()])
 
 
 def find_callback(trainer: Trainer, kind: type[C]) -> C | None:
@@ -126,3 +136,10 @@ def training_seconds(trainer: Trainer) -> float:
     """Seconds of the training clock; 0 without one."""
     clock = find_callback(trainer, TrainingClock)
     return 0.0 if clock is None else clock.seconds
+
+
+def training_share(trainer: Trainer) -> float:
+    """CPU seconds of this process per second of its training; 1 if it did not train."""
+    clock = find_callback(trainer, TrainingClock)
+    wall, cpu = (0.0, 0.0) if clock is None else clock.counted.tolist()
+    return cpu / wall if wall else 1.0

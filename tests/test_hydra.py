@@ -315,7 +315,13 @@ def test_the_estimate_counts_every_image_as_the_field_is_when_it_is_drawn(scenes
     images = validated * (5 + 3 + 2) + tested + video
     said = estimated(experiment, data, expected, 7.0)
     parts = f"7 s so far, 85 s of training, {images} s of scores and images"
-    assert said == f"{7 + 85 + images} s in all: {parts}"
+    total, advice = said.split("\n")
+    assert total == f"{7 + 85 + images} s in all: {parts}"
+    assert "media=false" in advice
+    # After a resume, neither steps nor evaluations are counted again.
+    images -= validated * (5 + 3)
+    rest = f"{7 + 35 + images} s in all: 7 s so far, 35 s of training, {images} s of scores and"
+    assert estimated(experiment, data, expected, 7.0, 100, 50.0).startswith(rest)
 
 
 def test_a_run_says_at_its_ends_what_it_takes_and_what_comes_next(scenes, tmp_path, capsys):

@@ -1,7 +1,7 @@
 """Lists of images with poses and times, and their conversion to views."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,7 +15,7 @@ from xplanes.scenes.entries import refuse_repeats, require_precision, some
 from xplanes.scenes.formats import UNTURN, mask_misfit, orientation
 from xplanes.scenes.images import GREY, Size, final_sizes, native_sizes, read_images
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
-from xplanes.scenes.masks import MaskKind, MaskUse, chosen_use, ignored_pixels, survey
+from xplanes.scenes.masks import MaskKind, ignored_pixels, survey
 from xplanes.scenes.views import Intrinsics, Views, spread
 
 SHORTEST, LONGEST = 1e-3, 1e5
@@ -328,54 +328,6 @@ def _without_ignored(listing: Listing, rest: Sequence[int]) -> Listing:
             f"{text}. Check the masks, or set data.mask_use=alpha if such images show empty space."
         )
     return listing.subset(rest)
-
-
-def read_splits(
-    parts: Mapping[str, Listing],
-    resolution: int | None,
-    cache: Path | None,
-    mask_use: MaskUse,
-    whole: Listing | None = None,
-) -> tuple[dict[str, Views], Views | None, dict[str, str]]:
-    """Read the images of all splits.
-
-    Args:
-        parts: The images of each split.
-        resolution: As for `read_views`.
-        cache: As for `read_views`.
-        mask_use: Meaning of the black parts of masks.
-        whole: All images of the capture, from which the meaning of the masks is determined for all
-            splits; those of ``parts`` when None.
-
-    Returns:
-        The views of each split, `Scene.lrm_views` and `Scene.notes`.
-
-    Raises:
-        SceneError: As `read_views`; or with mask_use lrm if there are no masks.
-    """
-    listings = [whole] if whole is not None else list(parts.values())
-    masks = [mask for listing in listings for mask in listing.masks]
-    notes = {"times": source} if (source := listings[0].time_source) else {}
-    if not any(masks):
-        if mask_use == "lrm":
-            raise SceneError(
-                "data.mask_use=lrm: no image has a mask file. Add masks, or set it to auto."
-            )
-        read = {split: read_views(part, resolution, cache) for split, part in parts.items()}
-        return read, None, notes
-    told = next((listing.mask_meaning for listing in listings if listing.mask_meaning), "")
-    kind = survey(masks, told == "ignored")
-    use, notes["masks"] = chosen_use(mask_use, kind, str(listings[0].paths[0].parent), told)
-    lrm_views = None
-    if use == "lrm":
-        if "train" in parts:
-            lrm_views = read_views(parts["train"], resolution, cache, kind=kind)
-        parts = {split: replace(part, masks=()) for split, part in parts.items()}
-    read = {
-        split: read_views(part, resolution, cache, use == "ignore", kind)
-        for split, part in parts.items()
-    }
-    return read, lrm_views, notes
 
 
 def _require_shapes(listing: Listing) -> None:

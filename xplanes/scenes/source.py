@@ -14,8 +14,9 @@ from xplanes.errors import ConfigError, MissingSplitError, SceneError, warn
 from xplanes.scenes.entries import some, world_turn
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.frame import CubeHints
-from xplanes.scenes.listing import Listing, Part, read_splits, thinned
-from xplanes.scenes.masks import MaskUse
+from xplanes.scenes.images import GREY
+from xplanes.scenes.listing import Listing, Part, read_views, thinned
+from xplanes.scenes.masks import MaskUse, chosen_use, survey
 from xplanes.scenes.views import Scene, Views, joined
 from xplanes.settings import Count, Location, Positive, Settings
 
@@ -49,18 +50,17 @@ def as_static(scene: Scene, reason: str) -> Scene:
         scene: The scene.
         reason: Why the scene is known to be static, for the header of a run.
     """
-    splits = {
-        name: replace(views, times=torch.zeros_like(views.times))
-        for name, views in scene.splits.items()
-    }
-    video = scene.video
-    if video is not None:
-        video = video.subset(torch.zeros(1, dtype=torch.long))
-        video = replace(video, times=torch.zeros(1))
-    lrm_views = scene.lrm_views
-    if lrm_views is not None:
-        lrm_views = replace(lrm_views, times=torch.zeros_like(lrm_views.times))
-    return replace(scene, splits=splits, video=video, lrm_views=lrm_views, static_reason=reason)
+
+    def still(views: Views) -> Views:
+        return replace(views, times=torch.zeros_like(views.times))
+
+    return replace(
+        scene,
+        splits={name: still(views) for name, views in scene.splits.items()},
+        video=None if scene.video is None else still(scene.video.subset([0])),
+        lrm_views=None if scene.lrm_views is None else still(scene.lrm_views),
+        static_reason=reason,
+    )
 
 
 def warn_of_masks(folder: Path, images: Sequence[Path]) -> None:
@@ -210,15 +210,35 @@ class SceneSettings(Settings, ABC):
         Args:
             parts: The images of each split.
             mask_use: Meaning of the black parts of masks.
-            whole: All images of the capture, see `read_splits`.
+            whole: All images of the capture, from which the meaning of the masks is determined for
+                all splits; those of ``parts`` when None.
             up: Description of the up direction; empty if the files' world is unchanged.
             **more: Further attributes of the scene.
 
         Raises:
-            SceneError: If an image or a mask cannot be used.
+            SceneError: If an image or a mask cannot be used, or with mask_use lrm if there are no
+                masks.
         """
-        read = read_splits(parts, self.resolution, self.image_cache, mask_use, whole)
-        splits, lrm_views, notes = read
+        listings = [whole] if whole is not None else list(parts.values())
+        masks = [mask for listing in listings for mask in listing.masks]
+        notes = {"times": source} if (source := listings[0].time_source) else {}
+        use, kind, lrm_views = mask_use, GREY, None
+        if any(masks):
+            told = next((listing.mask_meaning for listing in listings if listing.mask_meaning), "")
+            kind = survey(masks, told == "ignored")
+            use, notes["masks"] = chosen_use(mask_use, kind, str(listings[0].paths[0].parent), told)
+        elif mask_use == "lrm":
+            raise SceneError(
+                "data.mask_use=lrm: no image has a mask file. Add masks, or set it to auto."
+            )
+
+        def read(part: Listing) -> Views:
+            return read_views(part, self.resolution, self.image_cache, use == "ignore", kind)
+
+        if use == "lrm":
+            lrm_views = read(parts["train"]) if "train" in parts else None
+            parts = {split: replace(part, masks=()) for split, part in parts.items()}
+        splits = {split: read(part) for split, part in parts.items()}
         if not up:
             poses = torch.cat([listing.camera_to_world for listing in parts.values()])
             up = world_turn(poses, (), False)[1]
@@ -257,21 +277,18 @@ class SceneSettings(Settings, ABC):
         """The training views and the splits that are scored."""
         if self.eval_split is not None:
             return self.load(("train", self.eval_split))
-        for splits in (("train", "val", "test"), ("train", "val")):
+        for scored in (("val", "test"), ("val",), ("test",)):
             with suppress(MissingSplitError):
-                return self.load(splits)
-        try:
-            return self.load(("train", "test"))
-        except MissingSplitError:
-            scene = self.load(("train",))
-            train = scene.splits["train"]
-            if may_hold_out(train):
-                return scene
-            warn(
-                f"{self.folder}: {len(train)} images are too few to hold some out: the training "
-                "images are scored, which says little about other views."
-            )
-            return replace(scene, splits={**scene.splits, "val": train})
+                return self.load(("train", *scored))
+        scene = self.load(("train",))
+        train = scene.splits["train"]
+        if may_hold_out(train):
+            return scene
+        warn(
+            f"{self.folder}: {len(train)} images are too few to hold some out: the training "
+            "images are scored, which says little about other views."
+        )
+        return replace(scene, splits={**scene.splits, "val": train})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -275,8 +275,8 @@ def read_views(
 
     Raises:
         MissingSplitError: If all pixels of all images are masked out.
-        SceneError: If a file cannot be decoded, the resolution cannot be met, or `require_rays`
-            refuses a lens.
+        SceneError: If a file cannot be decoded, the resolution cannot be met, or
+            `final_intrinsics` refuses a camera.
     """
     if kind is None:
         kind = survey(listing.masks) if any(listing.masks) else GREY
@@ -292,7 +292,6 @@ def read_views(
     names = [str(path) for path in listing.paths]
     intrinsics = final_intrinsics(names, listing.calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(listing))]
-    require_rays(names, listing.calibrations, has_ray)
     masks = () if ignore else listing.masks
     images = read_images(listing.paths, sizes, masks, has_ray, cache, kind, listing.clear)
     if ignored is not None:
@@ -387,6 +386,8 @@ def final_intrinsics(
 ) -> Intrinsics:
     """Intrinsics of images in their final sizes.
 
+    Warns about perspective lenses that map no direction to some of the pixels.
+
     Args:
         labels: The images, for messages. [V]
         calibrations: Their calibrations. [V]
@@ -394,7 +395,8 @@ def final_intrinsics(
         sizes: Final heights and widths. [V]
 
     Raises:
-        SceneError: If a camera's intrinsics are implausible.
+        SceneError: If a camera's intrinsics are implausible, or if most pixels of a perspective
+            lens, or all pixels of another, have no ray.
     """
     known = [
         calibration.scaled(file, size)
@@ -409,7 +411,9 @@ def final_intrinsics(
     rows = [(c.distortion + pad)[: len(COEFFICIENTS)] for c in calibrations]
     model = torch.tensor([int(calibration.model) for calibration in calibrations])
     lenses = Lenses(model, torch.tensor(rows, dtype=torch.float64), skew)
-    return Intrinsics(focal, centre, torch.tensor(sizes), lenses)
+    intrinsics = Intrinsics(focal, centre, torch.tensor(sizes), lenses)
+    _require_rays(labels, calibrations, intrinsics)
+    return intrinsics
 
 
 def _require_real(
@@ -443,25 +447,17 @@ def _require_real(
         )
 
 
-def require_rays(
-    labels: Sequence[str], lenses: Sequence[Calibration], has_ray: Sequence[Tensor | None]
+def _require_rays(
+    labels: Sequence[str], cameras: Sequence[Calibration], intrinsics: Intrinsics
 ) -> None:
     """Refuse images where most pixels of a perspective lens, or all pixels of another, lack rays.
 
     Fewer such pixels of a perspective lens are left out, with a warning.
-
-    Args:
-        labels: The images, for messages. [V]
-        lenses: Their calibrations. [V]
-        has_ray: Pixels with a ray, None for all. bool [h, w] each, [V]
-
-    Raises:
-        SceneError: If there are such images; the message names all of them.
     """
     problems: list[str] = []
     folded: list[tuple[float, str]] = []
-    for label, lens, shown in zip(labels, lenses, has_ray, strict=True):
-        if shown is None:
+    for index, (label, lens) in enumerate(zip(labels, cameras, strict=True)):
+        if (shown := intrinsics.has_ray(index)) is None:
             continue
         share = float((~shown).float().mean())
         fault = (

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,8 +26,6 @@ FARTHEST_ASIDE, STRONGEST = 1e3, 1e6
 
 MOST_FOLDED = 0.5
 """Largest share of an image's pixels without a ray, for perspective lenses."""
-
-Part = TypeVar("Part", "Listing", Views)
 
 SHAPE_TOLERANCE = 0.02
 """Tolerance between the aspect ratios of an image and its camera."""
@@ -227,30 +225,6 @@ def held_out(listing: Listing, every: int) -> dict[str, list[int]]:
         "train": [index for index in range(len(listing)) if index not in chosen],
         "val": sorted(chosen),
     }
-
-
-def thinned(part: Part, count: int | None, key: str, where: str) -> Part:
-    """``count`` views, evenly spaced in temporal order, including the first and the last.
-
-    Args:
-        part: Views, or a list of images.
-        count: Number of views to keep; None keeps all.
-        key: The setting with the count, for messages.
-        where: Source of the views, for messages.
-
-    Raises:
-        SceneError: If there are fewer views.
-    """
-    if count is None:
-        return part
-    total = len(part)
-    if count > total:
-        raise SceneError(
-            f"{key}={count}, but {where} has {total} views. Give a number from 1 to {total}, or "
-            "null for all."
-        )
-    by_time = part.times.argsort(stable=True).tolist()
-    return part.subset(sorted(by_time[rank] for rank in spread(count, total)))
 
 
 def read_views(

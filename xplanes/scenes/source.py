@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -15,14 +15,15 @@ from xplanes.scenes.entries import some, world_turn
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.frame import CubeHints
 from xplanes.scenes.images import GREY
-from xplanes.scenes.listing import Listing, Part, read_views, thinned
+from xplanes.scenes.listing import Listing, read_views
 from xplanes.scenes.masks import MaskUse, chosen_use, survey
-from xplanes.scenes.views import Scene, Views, joined
+from xplanes.scenes.views import Scene, Views, joined, spread
 from xplanes.settings import Count, Location, Positive, Settings
+
+Part = TypeVar("Part", Listing, Views)
 
 SAME = 2
 """Largest difference of a static pixel between frames, in steps of 1/255."""
-
 
 HELD_OUT = 8
 """One in this many training views is held out if a scene has no validation split."""
@@ -182,6 +183,9 @@ class SceneSettings(Settings, ABC):
     def thinned(self, parts: Mapping[str, Part]) -> dict[str, Part]:
         """Splits, reduced to the numbers of views in `views` and `eval_views`.
 
+        The views that are kept are evenly spaced in temporal order, including the first and the
+        last.
+
         Args:
             parts: Views, or lists of images, by split name.
 
@@ -190,11 +194,18 @@ class SceneSettings(Settings, ABC):
         """
         found = {}
         for split, part in parts.items():
-            count, key = self.views, "data.views"
+            total, count = len(part), self.views
             if split != "train":
-                count, key = self.eval_views, "data.eval_views"
-                count = None if count is None else min(count, len(part))
-            found[split] = thinned(part, count, key, f"the {split} split of {self.folder}")
+                count = None if self.eval_views is None else min(self.eval_views, total)
+            if count is not None:
+                if count > total:
+                    raise SceneError(
+                        f"data.views={count}, but the {split} split of {self.folder} has {total} "
+                        f"views. Give a number from 1 to {total}, or null for all."
+                    )
+                by_time = part.times.argsort(stable=True).tolist()
+                part = part.subset(sorted(by_time[rank] for rank in spread(count, total)))
+            found[split] = part
         return found
 
     def scene_of(

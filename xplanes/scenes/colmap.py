@@ -200,7 +200,6 @@ class ColmapSettings(CaptureSettings):
         return unit_times(found), time_source(origin, names, found)
 
     def _places(self, listing: Listing, folders: Sequence[str]) -> dict[str, list[int]]:
-        """Indices of the images of each split."""
         tested: set[int] = set()
         for camera in self.test_cameras:
             inside = f"{camera.strip('/')}/"
@@ -223,7 +222,6 @@ class ColmapSettings(CaptureSettings):
 
 
 def _model_folder(folder: Path, name: str | None) -> Path:
-    """The folder of the sparse model."""
     names = MODELS if name is None else (name,)
     if (path := find_model(folder, names)) is not None:
         if name is None and path.name == "0":

@@ -359,7 +359,6 @@ def _points(path: Path) -> tuple[np.ndarray, float]:
 def _calibration(
     label: str, model: str, width: int, height: int, values: Sequence[float]
 ) -> Calibration:
-    """The calibration of a camera with COLMAP's parameters."""
     if model not in LENSES:
         raise SceneError(
             f"{label} has the camera model {model}, which is not read. These are: "

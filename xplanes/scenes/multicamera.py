@@ -408,7 +408,6 @@ def _source(label: str, folder: Path, name: Any) -> Path:
 def _split_cameras(
     folder: Path, cameras: Sequence[Camera], test_cameras: Sequence[str] | None
 ) -> dict[str, list[int]]:
-    """Indices of each split's cameras."""
     names = [camera.name for camera in cameras]
     if test_cameras is None:
         chosen = "cam00" if "cam00" in names else names[int(_distances(cameras).argmin())]

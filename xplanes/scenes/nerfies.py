@@ -1,7 +1,6 @@
 """Captures in the format of Nerfies, HyperNeRF and DyCheck: one camera file per image."""
 
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from xplanes.scenes.entries import (
     usable,
 )
 from xplanes.scenes.formats import ENDINGS
-from xplanes.scenes.images import native_sizes
+from xplanes.scenes.images import native_sizes, width_rank
 from xplanes.scenes.listing import Calibration, Listing, held_out, time_source
 from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.views import Scene
@@ -64,15 +63,15 @@ class NerfiesSettings(CaptureSettings):
             raise self.no_scene()
         chosen, source = _splits(folder, self.protocol)
         names = list(dict.fromkeys(name for part in chosen.values() for name in part))
-        pictures = _picture_folder(folder, names, self.resolution)
-        lost = {*_missing(folder / "rgb" / pictures, names)}
+        pictures, lost = _picture_folder(folder, names, self.resolution)
         names = [name for name in names if name not in lost]
         listing, names, points = self._listing(names, pictures)
-        chosen = {split: [n for n in part if n in {*names}] for split, part in chosen.items()}
         places = {name: place for place, name in enumerate(names)}
-        if chosen.get("val"):
-            found = {split: [places[name] for name in part] for split, part in chosen.items()}
-        else:
+        found = {
+            split: [places[name] for name in part if name in places]
+            for split, part in chosen.items()
+        }
+        if not found.get("val"):
             found = held_out(listing, self.eval_every)
         return self.capture(listing, found, splits, source, points)
 
@@ -278,30 +277,31 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
     return pose, calibration
 
 
-def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) -> str:
+def _picture_folder(
+    folder: Path, names: Sequence[str], resolution: int | None
+) -> tuple[str, list[str]]:
     """The folder in rgb of the smallest images that are at least as wide as requested.
 
     If there are none, or no width is requested, that of the largest images. If it lacks images,
     warns and uses the folder that lacks the fewest, preferring the next larger scale.
+    Also returns the names of the images that it lacks.
     """
     widths: dict[str, int] = {}
     lost: dict[str, list[str]] = {}
     for path in (folder / "rgb").glob("*x"):
         if not path.name[:-1].isdecimal():
             continue
-        missing = _missing(path, names)
-        there = next((name for name in names if name not in set(missing)), None)
-        if there is not None:
-            files = [path / f"{there}{end}" for end in ENDINGS]
-            widths[path.name] = native_sizes([next(filter(Path.is_file, files))])[0][1]
-            lost[path.name] = missing
+        choices = {name: [path / f"{name}{end}" for end in ENDINGS] for name in names}
+        files = {name: next(filter(Path.is_file, each), None) for name, each in choices.items()}
+        if found := [file for file in files.values() if file is not None]:
+            widths[path.name] = native_sizes(found[:1])[0][1]
+            lost[path.name] = [name for name, file in files.items() if file is None]
     if not widths:
         raise SceneError(
             f"{folder / 'rgb'} has no folder, such as 1x or 4x, with an image of {names[0]}. "
             f"{DOWNLOAD}"
         )
-    enough = {name: width for name, width in widths.items() if width >= (resolution or math.inf)}
-    wanted = min(enough, key=enough.__getitem__) if enough else max(widths, key=widths.__getitem__)
+    wanted = min(widths, key=lambda name: width_rank(widths[name], resolution))
 
     def rank(name: str) -> tuple[int, bool, int]:
         wider = widths[name] - widths[wanted]
@@ -314,14 +314,7 @@ def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) 
             f"{len(lost[wanted])} of {len(names)} images are not in {folder / 'rgb' / wanted}: "
             f"{some(lost[wanted])}. Those of rgb/{chosen} are read{rest}."
         )
-    return chosen
-
-
-def _missing(folder: Path, names: Sequence[str]) -> list[str]:
-    """Names without a file in a folder."""
-    return [
-        name for name in names if not any((folder / f"{name}{end}").is_file() for end in ENDINGS)
-    ]
+    return chosen, lost[chosen]
 
 
 def _points(path: Path) -> np.ndarray | None:

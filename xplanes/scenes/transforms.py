@@ -373,7 +373,6 @@ def read_frames(path: Path) -> dict[str, Any]:
 
 
 def _key(entries: Sequence[Mapping[str, Any]]) -> str:
-    """The key of the frames' times."""
     given = (key for key in TIMES if any(entry.get(key) is not None for entry in entries))
     return next(given, TIMES[0])
 

@@ -275,11 +275,9 @@ def _image_folder(folder: Path, name: str, model: SparseModel) -> Path:
         SceneError: If there is none.
     """
     places = [place for place in model.source.parents if place.is_relative_to(folder)]
-    for place in places:
+    for place in (*places, folder):
         if (place / name).is_dir():
             return place / name
-    if (folder / name).is_dir():
-        return folder / name
     holding = [
         place
         for place in (Path(place) for place, *_ in os.walk(folder) if name == USUAL)

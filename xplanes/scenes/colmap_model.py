@@ -93,10 +93,8 @@ class SparseModel:
 
 def find_model(folder: Path, names: Sequence[str] = MODELS) -> Path | None:
     """The first of the named folders inside ``folder`` that contains a sparse model."""
-    for name in names:
-        if any((folder / name / f"cameras.{end}").is_file() for end in ("bin", "txt")):
-            return folder / name
-    return None
+    places = (folder / name for name in names)
+    return next((place for place in places if _found(place, "cameras") is not None), None)
 
 
 def models_inside(folder: Path) -> list[Path]:

@@ -330,13 +330,10 @@ class RayBatches(Batches):
             drawn, more = self._from_files(self.views.images, uniform, generator), {}
         else:
             drawn, more = self._from_memory(self.views.images, uniform, rays, errors)
-        shape = (rays, 3)
-        if self.background == "random":
-            background = torch.rand(shape, generator=generator)
-        elif self.background == "one":
-            background = torch.rand(3, generator=generator).expand(shape)
-        else:
-            background = torch.ones(shape)
+        background = torch.ones(rays, 3)
+        if self.background != "white":
+            count = 1 if self.background == "one" else rays
+            background = torch.rand(count, 3, generator=generator).expand(rays, 3)
         move = torch.rand(rays, generator=generator) if self.background_jitter else None
         return more | self._served(drawn, background, move, uniform[:rays, 2].float())
 

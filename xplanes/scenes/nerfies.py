@@ -187,12 +187,10 @@ def _splits(folder: Path, protocol: str | None) -> tuple[dict[str, list[str]], P
 
 def _names(path: Path, content: Mapping[str, Any], key: str) -> list[str]:
     names = content.get(key)
-    good = isinstance(names, list) and names and all(isinstance(name, str | int) for name in names)
-    if not good:
+    if not (isinstance(names, list) and names and all(isinstance(n, str | int) for n in names)):
         raise SceneError(
             f"{path}: {key} is {short(names)}; it must be a list of one or more names of images."
         )
-    assert isinstance(names, list)
     texts = [str(name) for name in names]
     if outside := [name for name in texts if ".." in name.split("/")]:
         raise SceneError(f"{path}: {key} leaves the scene's folder: {some(outside)}.")
@@ -214,11 +212,7 @@ def _scene(path: Path) -> tuple[float, np.ndarray]:
 def _numbers(path: Path, content: Mapping[str, Any], key: str, count: int) -> np.ndarray:
     """A list of finite numbers. float64 [count]"""
     values = content.get(key)
-    if (
-        not isinstance(values, list)
-        or len(values) != count
-        or not all(is_number(value) for value in values)
-    ):
+    if not (isinstance(values, list) and len(values) == count and all(map(is_number, values))):
         raise SceneError(
             f"{path}: {key} is {short(values)}; it must be {count} numbers. {DOWNLOAD}"
         )

@@ -68,10 +68,16 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         BrokenFrameError: If there is no such file, or it is empty.
         SceneError: If it is not a name, or leaves the folder.
     """
-    choices = [*paths_inside(label, folder, name, key, "./train/r_000")]
-    choices += [folder / "images" / path.name for path in choices if path.parent == folder]
-    if (exact := next(filter(Path.is_file, choices), None)) is not None:
-        return _with_content(label, exact)
+    choices = []
+    for image in paths_inside(label, folder, name, key, "./train/r_000"):
+        if image.is_file():
+            return _with_content(label, image)
+        choices.append(image)
+    inside = [folder / "images" / path.name for path in choices if path.parent == folder]
+    for image in inside:
+        if image.is_file():
+            return _with_content(label, image)
+    choices += inside
     for image in choices:
         if (parent := _like(image.parent)) is None:
             continue

@@ -217,11 +217,12 @@ class SceneDataModule(LightningDataModule):
         chosen = torch.zeros(len(train), dtype=torch.bool)
         chosen[order[places]] = True
         train, val = (train.subset(part.nonzero()[:, 0]) for part in (~chosen, chosen))
+        shared = {*val.files}
         self._scene = replace(
             self.scene,
             splits=self.scene.splits | {"train": train, "val": val},
-            video=_without(self.scene.video, val.files),
-            lrm_views=_without(self.scene.lrm_views, val.files),
+            video=_without(self.scene.video, shared),
+            lrm_views=_without(self.scene.lrm_views, shared),
         )
         self._batches = {}  # Earlier batches included the held-out views.
         self.held_out = len(val)
@@ -376,9 +377,9 @@ class _GivenScene(SceneSettings):
         )
 
 
-def _without(views: Views | None, files: Sequence[str]) -> Views | None:
+def _without(views: Views | None, files: set[str]) -> Views | None:
     """Views except those of some files; None if none are left."""
-    if views is None or {*files}.isdisjoint(views.files):
+    if views is None or files.isdisjoint(views.files):
         return views
     kept = [index for index, file in enumerate(views.files) if file not in files]
     return views.subset(kept) if kept else None

@@ -285,8 +285,7 @@ def _picture_folder(
     for path in (folder / "rgb").glob("*x"):
         if not path.name[:-1].isdecimal():
             continue
-        choices = {name: [path / f"{name}{end}" for end in ENDINGS] for name in names}
-        files = {name: next(filter(Path.is_file, each), None) for name, each in choices.items()}
+        files = {name: _image_of(path, name) for name in names}
         if found := [file for file in files.values() if file is not None]:
             widths[path.name] = native_sizes(found[:1])[0][1]
             lost[path.name] = [name for name, file in files.items() if file is None]
@@ -309,6 +308,10 @@ def _picture_folder(
             f"{some(lost[wanted])}. Those of rgb/{chosen} are read{rest}."
         )
     return chosen, lost[chosen]
+
+
+def _image_of(folder: Path, name: str) -> Path | None:
+    return next(filter(Path.is_file, (folder / f"{name}{end}" for end in ENDINGS)), None)
 
 
 def _points(path: Path) -> np.ndarray | None:

@@ -273,7 +273,7 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
 
 def _picture_folder(
     folder: Path, names: Sequence[str], resolution: int | None
-) -> tuple[str, list[str]]:
+) -> tuple[str, set[str]]:
     """The folder in rgb of the smallest images that are at least as wide as requested.
 
     If there are none, or no width is requested, that of the largest images. If it lacks images,
@@ -307,7 +307,7 @@ def _picture_folder(
             f"{len(lost[wanted])} of {len(names)} images are not in {folder / 'rgb' / wanted}: "
             f"{some(lost[wanted])}. Those of rgb/{chosen} are read{rest}."
         )
-    return chosen, lost[chosen]
+    return chosen, {*lost[chosen]}
 
 
 def _image_of(folder: Path, name: str) -> Path | None:

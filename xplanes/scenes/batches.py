@@ -90,7 +90,7 @@ class Batches(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class BatchSettings(Settings, ABC):
-    """Base class of the settings of training batches."""
+    """Base class of the settings of training batches; its defaults are those of whole views."""
 
     def on(self, device: torch.device) -> "BatchSettings":
         """The settings with each auto resolved for a device."""
@@ -102,14 +102,14 @@ class BatchSettings(Settings, ABC):
         return False
 
     @property
-    @abstractmethod
     def most(self) -> int:
         """Maximum rays per batch; 0 if a batch is a whole view."""
+        return 0
 
     @property
-    @abstractmethod
     def most_samples(self) -> int | None:
         """Maximum samples per batch, on average; None without samples along rays."""
+        return None
 
     @abstractmethod
     def batches(self, views: Views, frame: Frame, *, seed: int, rank: int) -> Batches:
@@ -122,9 +122,9 @@ class BatchSettings(Settings, ABC):
             rank: Rank of the process among the processes that split the rays.
         """
 
-    @abstractmethod
     def fitting(self, rays: int, samples: int) -> int:
         """Number of rays in the next batch, given the rays and samples of the last one."""
+        return rays
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,19 +181,8 @@ class ViewSettings(BatchSettings):
 
     background: Literal["white", "one"]  # Background colour; one: drawn per batch.
 
-    @property
-    def most(self) -> int:
-        return 0
-
-    @property
-    def most_samples(self) -> int | None:
-        return None
-
     def batches(self, views: Views, frame: Frame, *, seed: int, rank: int) -> "ViewBatches":
         return ViewBatches(views, self, seed=seed, rank=rank)
-
-    def fitting(self, rays: int, samples: int) -> int:
-        return rays
 
 
 class ViewBatches(Batches):
@@ -341,16 +330,11 @@ class RayBatches(Batches):
             drawn, more = self._from_files(self.views.images, uniform, generator), {}
         else:
             drawn, more = self._from_memory(self.views.images, uniform, rays, errors)
-        shape = (rays, 3)
-        if self.background == "random":
-            background = torch.rand(shape, generator=generator)
-        elif self.background == "one":
-            background = torch.rand(3, generator=generator).expand(shape)
-        else:
-            background = torch.ones(shape)
-        move = None
-        if self.background_jitter:
-            move = torch.rand(rays, generator=generator)
+        background = torch.ones(rays, 3)
+        if self.background != "white":
+            count = 1 if self.background == "one" else rays
+            background = torch.rand(count, 3, generator=generator).expand(rays, 3)
+        move = torch.rand(rays, generator=generator) if self.background_jitter else None
         return more | self._served(drawn, background, move, uniform[:rays, 2].float())
 
     def _served(
@@ -361,12 +345,16 @@ class RayBatches(Batches):
         origins, directions = self.views.pixel_rays(view, row.float(), column.float())
         origins, directions = self.frame.rays(origins, directions)
         colour = colour.float() / 255
+        times = self.views.times[view]
+        if move is not None:
+            jittered = (times + self.background_jitter * (2 * move - 1)).clamp(0, 1)
+            times = torch.where(far & (colour[:, 3] == 0), jittered, times)
         more = self._slopes(directions, view, row, column, background) if self.slopes else {}
         return more | {
             "view": view,
             "origins": origins,
             "directions": directions,
-            "times": self._times(view, far & (colour[:, 3] == 0), move),
+            "times": times,
             "target": colour[:, :3] + (1 - colour[:, 3:]) * background,
             "background": background,
             "alpha": colour[:, 3],
@@ -448,14 +436,6 @@ class RayBatches(Batches):
             _, view, run = self.pools.pick(*uniform[:: _per_run(rays), :2].T)
             self.views.images.prefetch(view, run)
         self._prefetched = step + AHEAD
-
-    def _times(self, view: Tensor, empty: Tensor, move: Tensor | None) -> Tensor:
-        """Times of rays, jittered for those through empty space. int64 [R], bool [R], [R] -> [R]"""
-        times = self.views.times[view]
-        if move is None:
-            return times
-        move = self.background_jitter * (2 * move - 1)
-        return torch.where(empty, (times + move).clamp(0, 1), times)
 
 
 class DeviceBatches(RayBatches):

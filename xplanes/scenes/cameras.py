@@ -252,22 +252,17 @@ def upright(up_vectors: Tensor) -> Tensor | None:
     if length < 0.1:
         return None
     x, y, z = (up / length).tolist()
-    if z < 0:
-        # Rotate by 180 degrees about x first: near 180 degrees the smallest rotation is ill-posed.
-        flip = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-        return _upward(x, -y, -z) @ flip
-    return _upward(x, y, z)
-
-
-def _upward(x: float, y: float, z: float) -> Tensor:
-    """The smallest rotation that takes a unit vector with z >= 0 to the z axis. [3, 3]"""
+    # If z is negative, rotate by 180 degrees about x first, as the smallest rotation is ill-posed
+    # near 180 degrees.
+    side = -1.0 if z < 0 else 1.0
+    y, z = side * y, side * z
     share = 1 / (1 + z)
     rows = [
         [1 - x * x * share, -x * y * share, -x],
         [-x * y * share, 1 - y * y * share, -y],
         [x, y, z],
     ]
-    return torch.tensor(rows, dtype=torch.float64)
+    return torch.tensor(rows, dtype=torch.float64) * torch.tensor([1.0, side, side])
 
 
 def camera_around(

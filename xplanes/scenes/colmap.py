@@ -200,7 +200,6 @@ class ColmapSettings(CaptureSettings):
         return unit_times(found), time_source(origin, names, found)
 
     def _places(self, listing: Listing, folders: Sequence[str]) -> dict[str, list[int]]:
-        """Indices of the images of each split."""
         tested: set[int] = set()
         for camera in self.test_cameras:
             inside = f"{camera.strip('/')}/"
@@ -223,7 +222,6 @@ class ColmapSettings(CaptureSettings):
 
 
 def _model_folder(folder: Path, name: str | None) -> Path:
-    """The folder of the sparse model."""
     names = MODELS if name is None else (name,)
     if (path := find_model(folder, names)) is not None:
         if name is None and path.name == "0":
@@ -277,11 +275,9 @@ def _image_folder(folder: Path, name: str, model: SparseModel) -> Path:
         SceneError: If there is none.
     """
     places = [place for place in model.source.parents if place.is_relative_to(folder)]
-    for place in places:
+    for place in (*places, folder):
         if (place / name).is_dir():
             return place / name
-    if (folder / name).is_dir():
-        return folder / name
     holding = [
         place
         for place in (Path(place) for place, *_ in os.walk(folder) if name == USUAL)

@@ -93,10 +93,8 @@ class SparseModel:
 
 def find_model(folder: Path, names: Sequence[str] = MODELS) -> Path | None:
     """The first of the named folders inside ``folder`` that contains a sparse model."""
-    for name in names:
-        if any((folder / name / f"cameras.{end}").is_file() for end in ("bin", "txt")):
-            return folder / name
-    return None
+    places = (folder / name for name in names)
+    return next((place for place in places if _found(place, "cameras") is not None), None)
 
 
 def models_inside(folder: Path) -> list[Path]:
@@ -359,7 +357,6 @@ def _points(path: Path) -> tuple[np.ndarray, float]:
 def _calibration(
     label: str, model: str, width: int, height: int, values: Sequence[float]
 ) -> Calibration:
-    """The calibration of a camera with COLMAP's parameters."""
     if model not in LENSES:
         raise SceneError(
             f"{label} has the camera model {model}, which is not read. These are: "

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -80,16 +80,18 @@ class SceneDataModule(LightningDataModule):
         self._batches: dict[int, Batches] = {}
 
     @property
+    def _module(self) -> Any:
+        return None if self.trainer is None else self.trainer.lightning_module
+
+    @property
     def rays(self) -> int | None:
         """Number of rays in the next batch, if the LightningModule sets it (``rays``)."""
-        module = None if self.trainer is None else self.trainer.lightning_module
-        return getattr(module, "rays", None)
+        return getattr(self._module, "rays", None)
 
     @property
     def errors(self) -> Tensor | None:
         """Errors by tile, if the LightningModule has an ``error_map``, see `Batches.draw`."""
-        module = None if self.trainer is None else self.trainer.lightning_module
-        return getattr(getattr(module, "error_map", None), "errors", None)
+        return getattr(getattr(self._module, "error_map", None), "errors", None)
 
     @classmethod
     def of(cls, scene: Scene, *, seed: int = 0) -> "SceneDataModule":
@@ -163,9 +165,9 @@ class SceneDataModule(LightningDataModule):
 
     def setup(self, stage: str) -> None:
         """Read the splits that a stage needs: ``fit``, ``validate``, ``test`` or ``predict``."""
-        if stage == "fit" and self.trainer is not None:
+        if stage == "fit":
             # Each module continues its own count of batches.
-            self.first = getattr(self.trainer.lightning_module, "batches", self.first)
+            self.first = getattr(self._module, "batches", self.first)
         scores = self.trainer is None or self.trainer.limit_val_batches
         if stage in ("fit", "validate") and scores:
             if (split := self.validation_split) is None:
@@ -208,28 +210,27 @@ class SceneDataModule(LightningDataModule):
         train = self.scene.splits["train"]
         if not may_hold_out(train):
             return
-        chosen = torch.zeros(len(train), dtype=torch.bool)
         times, order = train.times.sort(stable=True)
         places = held_out_places(times.tolist(), HELD_OUT)
         if (most := self.settings.eval_views) is not None:
             places = [places[rank] for rank in spread(most, len(places))]
+        chosen = torch.zeros(len(train), dtype=torch.bool)
         chosen[order[places]] = True
-        parts = {
-            "train": train.subset((~chosen).nonzero()[:, 0]),
-            "val": train.subset(chosen.nonzero()[:, 0]),
-        }
-        shared = set(parts["val"].files)
-        rest = {name: getattr(self.scene, name) for name in ("video", "lrm_views")}
-        rest = {name: _without(views, shared) for name, views in rest.items()}
-        self._scene = replace(self.scene, splits=self.scene.splits | parts, **rest)
+        train, val = (train.subset(part.nonzero()[:, 0]) for part in (~chosen, chosen))
+        shared = {*val.files}
+        self._scene = replace(
+            self.scene,
+            splits=self.scene.splits | {"train": train, "val": val},
+            video=_without(self.scene.video, shared),
+            lrm_views=_without(self.scene.lrm_views, shared),
+        )
         self._batches = {}  # Earlier batches included the held-out views.
-        self.held_out = len(parts["val"])
+        self.held_out = len(val)
 
     def batches(self, rank: int) -> Batches:
         """The batches of a process for the module in training, drawn on its device if possible."""
-        module = None if self.trainer is None else self.trainer.lightning_module
-        batches = self.batches_for(module, rank)
-        device = getattr(module, "device", torch.device("cpu"))
+        batches = self.batches_for(self._module, rank)
+        device = getattr(self._module, "device", torch.device("cpu"))
         if isinstance(batches, RayBatches) and DeviceBatches.can_serve(batches, device):
             return DeviceBatches(batches, device)
         return batches
@@ -267,17 +268,16 @@ class SceneDataModule(LightningDataModule):
 
     def _views(self, split: str, tag: str, order: Sequence[int] | None = None) -> DataLoader:
         views = self.read_split(split)
-        order, sampler = range(len(views)) if order is None else order, None
+        order = sampler = range(len(views)) if order is None else order
         if self.trainer is not None and self.trainer.world_size > 1 and tag != "predict":
             # Each process scores its own views, at least one, or the others would wait forever.
-            order = order[self.trainer.global_rank :: self.trainer.world_size] or order[:1]
-            sampler = _Divided(len(order))
-        dataset = _WholeViews(views, self.scene.background, tag, order)
+            own = order[self.trainer.global_rank :: self.trainer.world_size]
+            sampler = _Divided(own or order[:1])
+        dataset = _WholeViews(views, self.scene.background, tag)
         return DataLoader(dataset, batch_size=None, sampler=sampler)
 
     def state_dict(self) -> dict[str, Any]:
-        module = None if self.trainer is None else self.trainer.lightning_module
-        return {"batches": getattr(module, "batches", self.first)}
+        return {"batches": getattr(self._module, "batches", self.first)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.first = state_dict["batches"]
@@ -303,28 +303,24 @@ class _Endless(IterableDataset):
 class _WholeViews(Dataset):
     """Dataset of whole views, see `whole_view`."""
 
-    def __init__(self, views: Views, background: Tensor, tag: str, order: Sequence[int]) -> None:
-        self.views, self.background, self.tag, self.order = views, background, tag, order
+    def __init__(self, views: Views, background: Tensor, tag: str) -> None:
+        self.views, self.background, self.tag = views, background, tag
 
-    def __len__(self) -> int:
-        return len(self.order)
-
-    def __getitem__(self, place: int) -> dict[str, Any]:
-        item = whole_view(self.views, self.order[place], self.background)
-        return item | {"tag": self.tag}
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        return whole_view(self.views, index, self.background) | {"tag": self.tag}
 
 
 class _Divided(DistributedSampler):
-    """All items of a process in order; prevents Lightning from dividing them among processes."""
+    """The views of one process, in order; prevents Lightning from dividing them further."""
 
-    def __init__(self, count: int) -> None:
-        self.count = count
+    def __init__(self, order: Sequence[int]) -> None:
+        self.order = order
 
     def __iter__(self) -> Iterator[int]:
-        return iter(range(self.count))
+        return iter(self.order)
 
     def __len__(self) -> int:
-        return self.count
+        return len(self.order)
 
 
 def whole_view(views: Views, index: int, background: Tensor) -> dict[str, Any]:
@@ -370,21 +366,10 @@ class _GivenScene(SceneSettings):
 
     @classmethod
     def around(cls, scene: Scene) -> "_GivenScene":
-        return cls(
-            name="given",
-            root=".",
-            scene=scene.name,
-            resolution=None,
-            views=None,
-            train_on_video=False,
-            static=None,
-            eval_split=None,
-            eval_views=None,
-            half_side=None,
-            centre=None,
-            refine_cameras=scene.refine_cameras,
-            cache=None,
-        )
+        given: dict[str, Any] = dict.fromkeys(entry.name for entry in fields(cls))
+        given |= {"name": "given", "root": ".", "scene": scene.name, "train_on_video": False}
+        given["refine_cameras"] = scene.refine_cameras
+        return cls(**given)
 
     def load(self, splits: Sequence[str]) -> Scene:
         raise MissingSplitError(
@@ -397,7 +382,7 @@ def _without(views: Views | None, files: set[str]) -> Views | None:
     if views is None or files.isdisjoint(views.files):
         return views
     kept = [index for index, file in enumerate(views.files) if file not in files]
-    return views.subset(torch.tensor(kept)) if kept else None
+    return views.subset(kept) if kept else None
 
 
 def found_root(run: Path, root: str) -> str:

@@ -222,9 +222,9 @@ def scene_frame(views: Views, hints: CubeHints = NO_HINTS) -> Frame:
         centre = seen.mean(dim=0)
     given = ""
     if hints.centre is not None:
-        centre, given = torch.tensor(hints.centre, dtype=torch.float32), "data.centre"
+        centre, given = torch.tensor(hints.centre, dtype=torch.float32), "data.centre and "
     if hints.half_side is not None:
-        return cube_frame(hints.half_side, centre, _joined(given, "data.half_side"))
+        return cube_frame(hints.half_side, centre, f"{given}data.half_side")
     offset = views.camera_to_world[:, :3, 3] - centre
     depth = (offset * views.camera_to_world[:, :3, 2]).sum(dim=-1)
     extent = (0.5 * views.intrinsics.size.flip(1) / views.intrinsics.pinhole).amax(dim=1)
@@ -238,16 +238,11 @@ def scene_frame(views: Views, hints: CubeHints = NO_HINTS) -> Frame:
         )
     if seen is not None:
         reach = (seen - centre).abs().max()
-        return cube_frame(min(half, float(reach)), centre, _joined(given, "points"))
+        return cube_frame(min(half, float(reach)), centre, f"{given}points")
     spread = _spread(views)
     reach = MARGIN * _reach(views, centre) / spread if spread > 0 else math.inf
     source = "cameras" if half <= reach or views.is_opaque else "cameras and silhouettes"
-    return cube_frame(min(half, reach), centre, _joined(given, source))
-
-
-def _joined(first: str, second: str) -> str:
-    """Join two sources of a cube; the first may be empty."""
-    return f"{first} and {second}" if first else second
+    return cube_frame(min(half, reach), centre, f"{given}{source}")
 
 
 def pixels_across(views: Views, frame: Frame) -> float:

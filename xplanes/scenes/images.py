@@ -63,6 +63,17 @@ def native_sizes(paths: Sequence[Path]) -> list[Size]:
     return all_of(lambda path: read_header(path)[0], paths)
 
 
+def width_rank(width: int, resolution: int | None) -> tuple[bool, int]:
+    """Sort key of copies of an image: the narrowest that is wide enough first, else the widest.
+
+    Args:
+        width: Width of the copy in pixels.
+        resolution: Wanted width in pixels; None wants the widest copy.
+    """
+    is_enough = resolution is not None and width >= resolution
+    return not is_enough, width if is_enough else -width
+
+
 def final_sizes(
     paths: Sequence[Path], native: Sequence[Size], resolution: int | None
 ) -> list[Size]:
@@ -143,8 +154,6 @@ def _jobs(
     kind: MaskKind = GREY,
     clear: Sequence[int] = (),
 ) -> list[store.Job]:
-    """Jobs that decode the images, one for each."""
-
     def job(index: int) -> store.Job:
         def decode() -> Iterator[tuple[int, np.ndarray]]:
             mask = masks[index] if masks else None

@@ -1,10 +1,10 @@
 """Lists of images with poses and times, and their conversion to views."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from xplanes.scenes.entries import refuse_repeats, require_precision, some
 from xplanes.scenes.formats import UNTURN, mask_misfit, orientation
 from xplanes.scenes.images import GREY, Size, final_sizes, native_sizes, read_images
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
-from xplanes.scenes.masks import MaskKind, MaskUse, chosen_use, ignored_pixels, survey
+from xplanes.scenes.masks import MaskKind, ignored_pixels, survey
 from xplanes.scenes.views import Intrinsics, Views, spread
 
 SHORTEST, LONGEST = 1e-3, 1e5
@@ -26,8 +26,6 @@ FARTHEST_ASIDE, STRONGEST = 1e3, 1e6
 
 MOST_FOLDED = 0.5
 """Largest share of an image's pixels without a ray, for perspective lenses."""
-
-Part = TypeVar("Part", "Listing", Views)
 
 SHAPE_TOLERANCE = 0.02
 """Tolerance between the aspect ratios of an image and its camera."""
@@ -229,30 +227,6 @@ def held_out(listing: Listing, every: int) -> dict[str, list[int]]:
     }
 
 
-def thinned(part: Part, count: int | None, key: str, where: str) -> Part:
-    """``count`` views, evenly spaced in temporal order, including the first and the last.
-
-    Args:
-        part: Views, or a list of images.
-        count: Number of views to keep; None keeps all.
-        key: The setting with the count, for messages.
-        where: Source of the views, for messages.
-
-    Raises:
-        SceneError: If there are fewer views.
-    """
-    if count is None:
-        return part
-    total = len(part)
-    if count > total:
-        raise SceneError(
-            f"{key}={count}, but {where} has {total} views. Give a number from 1 to {total}, or "
-            "null for all."
-        )
-    by_time = part.times.argsort(stable=True).tolist()
-    return part.subset(sorted(by_time[rank] for rank in spread(count, total)))
-
-
 def read_views(
     listing: Listing,
     resolution: int | None,
@@ -275,8 +249,8 @@ def read_views(
 
     Raises:
         MissingSplitError: If all pixels of all images are masked out.
-        SceneError: If a file cannot be decoded, the resolution cannot be met, or `require_rays`
-            refuses a lens.
+        SceneError: If a file cannot be decoded, the resolution cannot be met, or
+            `final_intrinsics` refuses a camera.
     """
     if kind is None:
         kind = survey(listing.masks) if any(listing.masks) else GREY
@@ -292,7 +266,6 @@ def read_views(
     names = [str(path) for path in listing.paths]
     intrinsics = final_intrinsics(names, listing.calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(listing))]
-    require_rays(names, listing.calibrations, has_ray)
     masks = () if ignore else listing.masks
     images = read_images(listing.paths, sizes, masks, has_ray, cache, kind, listing.clear)
     if ignored is not None:
@@ -328,54 +301,6 @@ def _without_ignored(listing: Listing, rest: Sequence[int]) -> Listing:
             f"{text}. Check the masks, or set data.mask_use=alpha if such images show empty space."
         )
     return listing.subset(rest)
-
-
-def read_splits(
-    parts: Mapping[str, Listing],
-    resolution: int | None,
-    cache: Path | None,
-    mask_use: MaskUse,
-    whole: Listing | None = None,
-) -> tuple[dict[str, Views], Views | None, dict[str, str]]:
-    """Read the images of all splits.
-
-    Args:
-        parts: The images of each split.
-        resolution: As for `read_views`.
-        cache: As for `read_views`.
-        mask_use: Meaning of the black parts of masks.
-        whole: All images of the capture, from which the meaning of the masks is determined for all
-            splits; those of ``parts`` when None.
-
-    Returns:
-        The views of each split, `Scene.lrm_views` and `Scene.notes`.
-
-    Raises:
-        SceneError: As `read_views`; or with mask_use lrm if there are no masks.
-    """
-    listings = [whole] if whole is not None else list(parts.values())
-    masks = [mask for listing in listings for mask in listing.masks]
-    notes = {"times": source} if (source := listings[0].time_source) else {}
-    if not any(masks):
-        if mask_use == "lrm":
-            raise SceneError(
-                "data.mask_use=lrm: no image has a mask file. Add masks, or set it to auto."
-            )
-        read = {split: read_views(part, resolution, cache) for split, part in parts.items()}
-        return read, None, notes
-    told = next((listing.mask_meaning for listing in listings if listing.mask_meaning), "")
-    kind = survey(masks, told == "ignored")
-    use, notes["masks"] = chosen_use(mask_use, kind, str(listings[0].paths[0].parent), told)
-    lrm_views = None
-    if use == "lrm":
-        if "train" in parts:
-            lrm_views = read_views(parts["train"], resolution, cache, kind=kind)
-        parts = {split: replace(part, masks=()) for split, part in parts.items()}
-    read = {
-        split: read_views(part, resolution, cache, use == "ignore", kind)
-        for split, part in parts.items()
-    }
-    return read, lrm_views, notes
 
 
 def _require_shapes(listing: Listing) -> None:
@@ -435,6 +360,8 @@ def final_intrinsics(
 ) -> Intrinsics:
     """Intrinsics of images in their final sizes.
 
+    Warns about perspective lenses that map no direction to some of the pixels.
+
     Args:
         labels: The images, for messages. [V]
         calibrations: Their calibrations. [V]
@@ -442,7 +369,8 @@ def final_intrinsics(
         sizes: Final heights and widths. [V]
 
     Raises:
-        SceneError: If a camera's intrinsics are implausible.
+        SceneError: If a camera's intrinsics are implausible, or if most pixels of a perspective
+            lens, or all pixels of another, have no ray.
     """
     known = [
         calibration.scaled(file, size)
@@ -457,7 +385,9 @@ def final_intrinsics(
     rows = [(c.distortion + pad)[: len(COEFFICIENTS)] for c in calibrations]
     model = torch.tensor([int(calibration.model) for calibration in calibrations])
     lenses = Lenses(model, torch.tensor(rows, dtype=torch.float64), skew)
-    return Intrinsics(focal, centre, torch.tensor(sizes), lenses)
+    intrinsics = Intrinsics(focal, centre, torch.tensor(sizes), lenses)
+    _require_rays(labels, calibrations, intrinsics)
+    return intrinsics
 
 
 def _require_real(
@@ -491,25 +421,17 @@ def _require_real(
         )
 
 
-def require_rays(
-    labels: Sequence[str], lenses: Sequence[Calibration], has_ray: Sequence[Tensor | None]
+def _require_rays(
+    labels: Sequence[str], cameras: Sequence[Calibration], intrinsics: Intrinsics
 ) -> None:
     """Refuse images where most pixels of a perspective lens, or all pixels of another, lack rays.
 
     Fewer such pixels of a perspective lens are left out, with a warning.
-
-    Args:
-        labels: The images, for messages. [V]
-        lenses: Their calibrations. [V]
-        has_ray: Pixels with a ray, None for all. bool [h, w] each, [V]
-
-    Raises:
-        SceneError: If there are such images; the message names all of them.
     """
     problems: list[str] = []
     folded: list[tuple[float, str]] = []
-    for label, lens, shown in zip(labels, lenses, has_ray, strict=True):
-        if shown is None:
+    for index, (label, lens) in enumerate(zip(labels, cameras, strict=True)):
+        if (shown := intrinsics.has_ray(index)) is None:
             continue
         share = float((~shown).float().mean())
         fault = (

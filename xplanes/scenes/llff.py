@@ -1,6 +1,5 @@
 """Captures in the format of LLFF: poses_bounds.npy, and a folder with one image per row."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 
 from xplanes.scenes.entries import unit_times
 from xplanes.scenes.formats import is_image
-from xplanes.scenes.images import native_sizes
+from xplanes.scenes.images import native_sizes, width_rank
 from xplanes.scenes.listing import Listing, held_out, time_source
 from xplanes.scenes.multicamera import POSES, read_poses_bounds, recordings_of_cameras
 from xplanes.scenes.name_times import times_in_names
@@ -36,7 +35,9 @@ class LlffSettings(CaptureSettings):
         path = self.folder / POSES
         if not (path.is_file() and (found := _image_folders(self.folder))):
             raise self.no_scene()
-        images = _chosen(found, self.resolution)
+        images = min(
+            found, key=lambda each: width_rank(native_sizes(each[:1])[0][1], self.resolution)
+        )
         names = [image.name for image in images]
         labels, poses, calibrations = zip(*read_poses_bounds(path, names), strict=True)
         dynamic = any((self.folder / name).is_dir() for name in DYNAMIC)
@@ -61,13 +62,3 @@ def _image_folders(folder: Path) -> list[list[Path]]:
     found = [path for path in folder.glob("images*") if path.is_dir()]
     listed = [sorted(filter(is_image, path.iterdir())) for path in sorted(found)]
     return [images for images in listed if images]
-
-
-def _chosen(folders: Sequence[list[Path]], resolution: int | None) -> list[Path]:
-    """The smallest images that are at least as wide as requested; else the largest ones."""
-    widths = [native_sizes(images[:1])[0][1] for images in folders]
-    wanted = math.inf if resolution is None else resolution
-    enough = [place for place, width in enumerate(widths) if width >= wanted]
-    if enough:
-        return folders[min(enough, key=widths.__getitem__)]
-    return folders[max(range(len(folders)), key=widths.__getitem__)]

@@ -41,12 +41,7 @@ from xplanes.scenes.images import (
     read_image,
     shrink,
 )
-from xplanes.scenes.listing import (
-    Calibration,
-    final_intrinsics,
-    misshapen,
-    require_rays,
-)
+from xplanes.scenes.listing import Calibration, final_intrinsics, misshapen
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.transforms import read_calibration, read_frames
 from xplanes.scenes.views import Scene, Views
@@ -184,17 +179,17 @@ class Recording:
         size: Height and width of the frames.
         count: Number of frames.
         rate: Frames per second; None for images and if the video has none.
-        images: The image files in the order of time; empty for a video. [count]
         times: Presentation times of a video's frames in seconds, or numbers of images if some are
             left out; empty if unknown. [count]
+        images: The image files in the order of time; empty for a video. [count]
     """
 
     camera: Camera
     size: Size
     count: int
     rate: float | None
-    images: tuple[Path, ...] = ()
     times: tuple[float, ...] = ()
+    images: tuple[Path, ...] = ()
 
     @property
     def step(self) -> float:
@@ -413,7 +408,6 @@ def _source(label: str, folder: Path, name: Any) -> Path:
 def _split_cameras(
     folder: Path, cameras: Sequence[Camera], test_cameras: Sequence[str] | None
 ) -> dict[str, list[int]]:
-    """Indices of each split's cameras."""
     names = [camera.name for camera in cameras]
     if test_cameras is None:
         chosen = "cam00" if "cam00" in names else names[int(_distances(cameras).argmin())]
@@ -463,9 +457,7 @@ def _video_camera(cameras: Sequence[Camera], parts: dict[str, list[int]], name: 
 def _recording(camera: Camera) -> Recording:
     """The frames of a camera, read from headers only."""
     if camera.source.is_file():
-        video = videos.read_header(camera.source)
-        rate = None if video.rate is None else float(video.rate)
-        return Recording(camera, video.size, video.count, rate, times=video.times)
+        return Recording(camera, *videos.read_header(camera.source))
     images = _images_in(camera.source)
     if not images:
         raise SceneError(
@@ -479,7 +471,7 @@ def _recording(camera: Camera) -> Recording:
                 f"{path} has {size[1]}x{size[0]} pixels, but {images[0]} of the same camera has "
                 f"{sizes[0][1]}x{sizes[0][0]}. Export its frames alike."
             )
-    return Recording(camera, sizes[0], len(images), None, tuple(images))
+    return Recording(camera, sizes[0], len(images), None, images=tuple(images))
 
 
 def _images_in(folder: Path) -> list[Path]:
@@ -622,7 +614,6 @@ def _read_views(
     labels = [recording.camera.label for recording in recordings]
     intrinsics = final_intrinsics(labels, calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(recordings))]
-    require_rays(labels, calibrations, has_ray)
     firsts = (counts.cumsum(0) - counts).tolist()
     jobs = [
         _job(recording, own, size, shown, first)

@@ -1,7 +1,6 @@
 """Captures in the format of Nerfies, HyperNeRF and DyCheck: one camera file per image."""
 
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from xplanes.scenes.entries import (
     usable,
 )
 from xplanes.scenes.formats import ENDINGS
-from xplanes.scenes.images import native_sizes
+from xplanes.scenes.images import native_sizes, width_rank
 from xplanes.scenes.listing import Calibration, Listing, held_out, time_source
 from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.views import Scene
@@ -64,15 +63,15 @@ class NerfiesSettings(CaptureSettings):
             raise self.no_scene()
         chosen, source = _splits(folder, self.protocol)
         names = list(dict.fromkeys(name for part in chosen.values() for name in part))
-        pictures = _picture_folder(folder, names, self.resolution)
-        lost = {*_missing(folder / "rgb" / pictures, names)}
+        pictures, lost = _picture_folder(folder, names, self.resolution)
         names = [name for name in names if name not in lost]
         listing, names, points = self._listing(names, pictures)
-        chosen = {split: [n for n in part if n in {*names}] for split, part in chosen.items()}
         places = {name: place for place, name in enumerate(names)}
-        if chosen.get("val"):
-            found = {split: [places[name] for name in part] for split, part in chosen.items()}
-        else:
+        found = {
+            split: [places[name] for name in part if name in places]
+            for split, part in chosen.items()
+        }
+        if not found.get("val"):
             found = held_out(listing, self.eval_every)
         return self.capture(listing, found, splits, source, points)
 
@@ -188,12 +187,10 @@ def _splits(folder: Path, protocol: str | None) -> tuple[dict[str, list[str]], P
 
 def _names(path: Path, content: Mapping[str, Any], key: str) -> list[str]:
     names = content.get(key)
-    good = isinstance(names, list) and names and all(isinstance(name, str | int) for name in names)
-    if not good:
+    if not (isinstance(names, list) and names and all(isinstance(n, str | int) for n in names)):
         raise SceneError(
             f"{path}: {key} is {short(names)}; it must be a list of one or more names of images."
         )
-    assert isinstance(names, list)
     texts = [str(name) for name in names]
     if outside := [name for name in texts if ".." in name.split("/")]:
         raise SceneError(f"{path}: {key} leaves the scene's folder: {some(outside)}.")
@@ -215,11 +212,7 @@ def _scene(path: Path) -> tuple[float, np.ndarray]:
 def _numbers(path: Path, content: Mapping[str, Any], key: str, count: int) -> np.ndarray:
     """A list of finite numbers. float64 [count]"""
     values = content.get(key)
-    if (
-        not isinstance(values, list)
-        or len(values) != count
-        or not all(is_number(value) for value in values)
-    ):
+    if not (isinstance(values, list) and len(values) == count and all(map(is_number, values))):
         raise SceneError(
             f"{path}: {key} is {short(values)}; it must be {count} numbers. {DOWNLOAD}"
         )
@@ -278,30 +271,30 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
     return pose, calibration
 
 
-def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) -> str:
+def _picture_folder(
+    folder: Path, names: Sequence[str], resolution: int | None
+) -> tuple[str, set[str]]:
     """The folder in rgb of the smallest images that are at least as wide as requested.
 
     If there are none, or no width is requested, that of the largest images. If it lacks images,
     warns and uses the folder that lacks the fewest, preferring the next larger scale.
+    Also returns the names of the images that it lacks.
     """
     widths: dict[str, int] = {}
     lost: dict[str, list[str]] = {}
     for path in (folder / "rgb").glob("*x"):
         if not path.name[:-1].isdecimal():
             continue
-        missing = _missing(path, names)
-        there = next((name for name in names if name not in set(missing)), None)
-        if there is not None:
-            files = [path / f"{there}{end}" for end in ENDINGS]
-            widths[path.name] = native_sizes([next(filter(Path.is_file, files))])[0][1]
-            lost[path.name] = missing
+        files = {name: _image_of(path, name) for name in names}
+        if found := [file for file in files.values() if file is not None]:
+            widths[path.name] = native_sizes(found[:1])[0][1]
+            lost[path.name] = [name for name, file in files.items() if file is None]
     if not widths:
         raise SceneError(
             f"{folder / 'rgb'} has no folder, such as 1x or 4x, with an image of {names[0]}. "
             f"{DOWNLOAD}"
         )
-    enough = {name: width for name, width in widths.items() if width >= (resolution or math.inf)}
-    wanted = min(enough, key=enough.__getitem__) if enough else max(widths, key=widths.__getitem__)
+    wanted = min(widths, key=lambda name: width_rank(widths[name], resolution))
 
     def rank(name: str) -> tuple[int, bool, int]:
         wider = widths[name] - widths[wanted]
@@ -314,14 +307,11 @@ def _picture_folder(folder: Path, names: Sequence[str], resolution: int | None) 
             f"{len(lost[wanted])} of {len(names)} images are not in {folder / 'rgb' / wanted}: "
             f"{some(lost[wanted])}. Those of rgb/{chosen} are read{rest}."
         )
-    return chosen
+    return chosen, {*lost[chosen]}
 
 
-def _missing(folder: Path, names: Sequence[str]) -> list[str]:
-    """Names without a file in a folder."""
-    return [
-        name for name in names if not any((folder / f"{name}{end}").is_file() for end in ENDINGS)
-    ]
+def _image_of(folder: Path, name: str) -> Path | None:
+    return next(filter(Path.is_file, (folder / f"{name}{end}" for end in ENDINGS)), None)
 
 
 def _points(path: Path) -> np.ndarray | None:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -14,14 +14,16 @@ from xplanes.errors import ConfigError, MissingSplitError, SceneError, warn
 from xplanes.scenes.entries import some, world_turn
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.frame import CubeHints
-from xplanes.scenes.listing import Listing, Part, read_splits, thinned
-from xplanes.scenes.masks import MaskUse
-from xplanes.scenes.views import Scene, Views, joined
+from xplanes.scenes.images import GREY
+from xplanes.scenes.listing import Listing, read_views
+from xplanes.scenes.masks import MaskUse, chosen_use, survey
+from xplanes.scenes.views import Scene, Views, joined, spread
 from xplanes.settings import Count, Location, Positive, Settings
+
+Part = TypeVar("Part", Listing, Views)
 
 SAME = 2
 """Largest difference of a static pixel between frames, in steps of 1/255."""
-
 
 HELD_OUT = 8
 """One in this many training views is held out if a scene has no validation split."""
@@ -49,18 +51,17 @@ def as_static(scene: Scene, reason: str) -> Scene:
         scene: The scene.
         reason: Why the scene is known to be static, for the header of a run.
     """
-    splits = {
-        name: replace(views, times=torch.zeros_like(views.times))
-        for name, views in scene.splits.items()
-    }
-    video = scene.video
-    if video is not None:
-        video = video.subset(torch.zeros(1, dtype=torch.long))
-        video = replace(video, times=torch.zeros(1))
-    lrm_views = scene.lrm_views
-    if lrm_views is not None:
-        lrm_views = replace(lrm_views, times=torch.zeros_like(lrm_views.times))
-    return replace(scene, splits=splits, video=video, lrm_views=lrm_views, static_reason=reason)
+
+    def still(views: Views) -> Views:
+        return replace(views, times=torch.zeros_like(views.times))
+
+    return replace(
+        scene,
+        splits={name: still(views) for name, views in scene.splits.items()},
+        video=None if scene.video is None else still(scene.video.subset([0])),
+        lrm_views=None if scene.lrm_views is None else still(scene.lrm_views),
+        static_reason=reason,
+    )
 
 
 def warn_of_masks(folder: Path, images: Sequence[Path]) -> None:
@@ -182,6 +183,9 @@ class SceneSettings(Settings, ABC):
     def thinned(self, parts: Mapping[str, Part]) -> dict[str, Part]:
         """Splits, reduced to the numbers of views in `views` and `eval_views`.
 
+        The views that are kept are evenly spaced in temporal order, including the first and the
+        last.
+
         Args:
             parts: Views, or lists of images, by split name.
 
@@ -190,11 +194,18 @@ class SceneSettings(Settings, ABC):
         """
         found = {}
         for split, part in parts.items():
-            count, key = self.views, "data.views"
+            total, count = len(part), self.views
             if split != "train":
-                count, key = self.eval_views, "data.eval_views"
-                count = None if count is None else min(count, len(part))
-            found[split] = thinned(part, count, key, f"the {split} split of {self.folder}")
+                count = None if self.eval_views is None else min(self.eval_views, total)
+            if count is not None:
+                if count > total:
+                    raise SceneError(
+                        f"data.views={count}, but the {split} split of {self.folder} has {total} "
+                        f"views. Give a number from 1 to {total}, or null for all."
+                    )
+                by_time = part.times.argsort(stable=True).tolist()
+                part = part.subset(sorted(by_time[rank] for rank in spread(count, total)))
+            found[split] = part
         return found
 
     def scene_of(
@@ -210,15 +221,35 @@ class SceneSettings(Settings, ABC):
         Args:
             parts: The images of each split.
             mask_use: Meaning of the black parts of masks.
-            whole: All images of the capture, see `read_splits`.
+            whole: All images of the capture, from which the meaning of the masks is determined for
+                all splits; those of ``parts`` when None.
             up: Description of the up direction; empty if the files' world is unchanged.
             **more: Further attributes of the scene.
 
         Raises:
-            SceneError: If an image or a mask cannot be used.
+            SceneError: If an image or a mask cannot be used, or with mask_use lrm if there are no
+                masks.
         """
-        read = read_splits(parts, self.resolution, self.image_cache, mask_use, whole)
-        splits, lrm_views, notes = read
+        listings = [whole] if whole is not None else list(parts.values())
+        masks = [mask for listing in listings for mask in listing.masks]
+        notes = {"times": source} if (source := listings[0].time_source) else {}
+        use, kind, lrm_views = mask_use, GREY, None
+        if any(masks):
+            told = next((listing.mask_meaning for listing in listings if listing.mask_meaning), "")
+            kind = survey(masks, told == "ignored")
+            use, notes["masks"] = chosen_use(mask_use, kind, str(listings[0].paths[0].parent), told)
+        elif mask_use == "lrm":
+            raise SceneError(
+                "data.mask_use=lrm: no image has a mask file. Add masks, or set it to auto."
+            )
+
+        def read(part: Listing) -> Views:
+            return read_views(part, self.resolution, self.image_cache, use == "ignore", kind)
+
+        if use == "lrm":
+            lrm_views = read(parts["train"]) if "train" in parts else None
+            parts = {split: replace(part, masks=()) for split, part in parts.items()}
+        splits = {split: read(part) for split, part in parts.items()}
         if not up:
             poses = torch.cat([listing.camera_to_world for listing in parts.values()])
             up = world_turn(poses, (), False)[1]
@@ -257,21 +288,18 @@ class SceneSettings(Settings, ABC):
         """The training views and the splits that are scored."""
         if self.eval_split is not None:
             return self.load(("train", self.eval_split))
-        for splits in (("train", "val", "test"), ("train", "val")):
+        for scored in (("val", "test"), ("val",), ("test",)):
             with suppress(MissingSplitError):
-                return self.load(splits)
-        try:
-            return self.load(("train", "test"))
-        except MissingSplitError:
-            scene = self.load(("train",))
-            train = scene.splits["train"]
-            if may_hold_out(train):
-                return scene
-            warn(
-                f"{self.folder}: {len(train)} images are too few to hold some out: the training "
-                "images are scored, which says little about other views."
-            )
-            return replace(scene, splits={**scene.splits, "val": train})
+                return self.load(("train", *scored))
+        scene = self.load(("train",))
+        train = scene.splits["train"]
+        if may_hold_out(train):
+            return scene
+        warn(
+            f"{self.folder}: {len(train)} images are too few to hold some out: the training "
+            "images are scored, which says little about other views."
+        )
+        return replace(scene, splits={**scene.splits, "val": train})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -449,13 +449,11 @@ def _bits(first: Sequence[int], index: int) -> int:
 
 
 def _length(sizes: Sequence[Size], channels: int) -> int:
-    """Length of a file in bytes."""
     first = _firsts(sizes)
     return _bits(first, len(sizes)) if channels == 4 else first[-1] * channels
 
 
 def _largest(sizes: Sequence[Size]) -> Size:
-    """Largest height and largest width."""
     return max(height for height, _ in sizes), max(width for _, width in sizes)
 
 

@@ -52,19 +52,19 @@ OTHER_AXES = ("from_mitsuba", "normal_mts_args", "from_na")
 OTHER_LENSES = ("equirectangular", "latlong", "orthographic", "ftheta_p0")
 """Keys of unsupported lenses in files of instant-ngp."""
 
+TIMES = ("time", "timestamp")
+"""Keys of times; the first one that a frame has is used."""
+
 NUMBERS = (
     *PIXELS,
     *COEFFICIENTS,
-    *("sx1", "sy1", "omega", "camera_angle_x", "camera_angle_y", "time", "timestamp"),
-    *("x_fov", "y_fov", "fovx", "fovy"),
+    *("sx1", "sy1", "omega", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "fovx", "fovy"),
+    *TIMES,
 )
 """Keys with numbers, which some programs write as strings."""
 
 ALIASES = {"fx": "fl_x", "fy": "fl_y", "width": "w", "height": "h"}
 """Other names of keys in pixels."""
-
-TIMES = ("time", "timestamp")
-"""Keys of times; the first one that a frame has is used."""
 
 DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Order of nerfstudio's list of distortion coefficients."""
@@ -75,13 +75,14 @@ SQUARE = 0.01
 MATRICES = ("intrinsic_matrix", "intrinsics", "K")
 """Keys of intrinsic matrices, of 3 rows and columns or more."""
 
+TRANSPARENT = {"white_transparent": 255, "black_transparent": 0}
+"""Keys of instant-ngp that declare a grey level transparent, with this level."""
+
 KNOWN = (
     *("frames", "file_path", "transform_matrix", "transform_matrix_start", "mask_path"),
-    *TIMES,
-    *("camera_angle_x", "camera_angle_y", "camera_model", "is_fisheye", "distortion_params"),
-    *("omega", "train_filenames", "val_filenames", "test_filenames", *PIXELS, *COEFFICIENTS),
-    *("sx1", "sy1", "x_fov", "y_fov", "fovx", "fovy", *OTHER_LENSES, *OTHER_AXES),
-    *("white_transparent", "black_transparent", "orientation_override"),
+    *("camera_model", "is_fisheye", "distortion_params", "orientation_override"),
+    *("train_filenames", "val_filenames", "test_filenames"),
+    *(*NUMBERS, *OTHER_LENSES, *OTHER_AXES, *TRANSPARENT),
 )
 """Keys that are read, or refused."""
 
@@ -101,9 +102,6 @@ BESIDE = {
     "alpha": ["{stem}.alpha{suffix}", "{stem}{suffix}.alpha{suffix}"],
 }
 """Names of mask files beside an image, by their meaning."""
-
-TRANSPARENT = {"white_transparent": 255, "black_transparent": 0}
-"""Keys of instant-ngp that declare a grey level transparent, with this level."""
 
 SYNONYMS = {"sx1": "s1", "sy1": "s3"}
 """COLMAP's names of a fisheye lens's prism coefficients."""
@@ -232,19 +230,15 @@ def _calibrations(
         for camera, frame in zip(stated, frames, strict=True)
     )
     if stretched := sum(new != old for new, old in zip(found, stated, strict=True)):
+        given = {*content, *(key for frame in frames for key in frame.entry)}
+        key = next((key for key in ("y_fov", "fovy") if key in given), "camera_angle_y")
         warn(
-            f"{path}: {_angle_key(content, frames)} of {stretched} of {len(found)} frames gives "
+            f"{path}: {key} of {stretched} of {len(found)} frames gives "
             "pixels that are not square, and is used. If they are square, remove it: Blender's own "
             "angle_y belongs to the sensor, not to the image."
         )
     _warn_of_two_focal_lengths(path, content, frames, found)
     return found
-
-
-def _angle_key(content: Mapping[str, Any], frames: Sequence[_Frame]) -> str:
-    """The key of the vertical field of view, as the file has it."""
-    given = {*content, *(key for frame in frames for key in frame.entry)}
-    return next((key for key in ("y_fov", "fovy") if key in given), "camera_angle_y")
 
 
 def _warn_of_two_focal_lengths(
@@ -379,7 +373,6 @@ def read_frames(path: Path) -> dict[str, Any]:
 
 
 def _key(entries: Sequence[Mapping[str, Any]]) -> str:
-    """The key of the frames' times."""
     given = (key for key in TIMES if any(entry.get(key) is not None for entry in entries))
     return next(given, TIMES[0])
 

@@ -1,8 +1,6 @@
 """Frames of video files, decoded with PyAV (extra `video`)."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -16,32 +14,16 @@ from xplanes.scenes.images import Size
 SUFFIXES = """.mp4 .mov .m4v .mkv .webm .avi .mpg .mpeg .ts .mts .m2ts .3gp .wmv""".split()
 """Suffixes of video files."""
 
-
 HDR = {16: "PQ", 18: "HLG"}
 """Transfer characteristics of HDR videos, by their numbers in ITU-T H.273."""
 
 
-@dataclass(frozen=True)
-class Video:
-    """The header of a video file.
+def read_header(path: Path) -> tuple[Size, int, float | None, tuple[float, ...]]:
+    """Read the header of a video file. Nothing is decoded.
 
-    Attributes:
-        path: The file.
-        size: Height and width of its frames.
-        count: Number of frames that are shown.
-        rate: Frames per second; None if unknown.
-        times: Presentation times of the frames in seconds; empty if unknown.
-    """
-
-    path: Path
-    size: Size
-    count: int
-    rate: Fraction | None
-    times: tuple[float, ...]
-
-
-def read_header(path: Path) -> Video:
-    """Size, number, rate and times of a video's frames. Nothing is decoded.
+    Returns:
+        Height and width of its frames, number of frames that are shown, frames per second, None if
+        unknown, and presentation times of the frames in seconds, empty if unknown.
 
     Raises:
         SceneError: If the file is not a video.
@@ -66,7 +48,8 @@ def read_header(path: Path) -> Video:
                     "pale. Convert it to SDR first."
                 )
             size = (stream.codec_context.height, stream.codec_context.width)
-            return Video(path, size, len(stamps), stream.average_rate, times)
+            rate = None if stream.average_rate is None else float(stream.average_rate)
+            return size, len(stamps), rate, times
     except av.FFmpegError as problem:
         raise _unreadable(path, problem) from problem
 

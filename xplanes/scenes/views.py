@@ -94,18 +94,11 @@ class Intrinsics:
     @property
     def is_shared(self) -> bool:
         """Whether all images have the same intrinsics."""
-        room = SAME_CAMERA * self.size.max()
-        pairs = [
-            (self.focal / self.focal[0] - 1, SAME_CAMERA),
-            (self.centre - self.centre[0], room),
-        ]
+        room = float(SAME_CAMERA * self.size.max())
+        rows = [(self.size, 0), (self.focal / self.focal[0], SAME_CAMERA), (self.centre, room)]
         if (lenses := self.lenses) is not None:
-            pairs.append((lenses.model - lenses.model[0], 0))
-            pairs.append((lenses.coefficients - lenses.coefficients[0], SAME_CAMERA))
-            pairs.append((lenses.skew - lenses.skew[0], float(room)))
-        return bool((self.size == self.size[0]).all()) and all(
-            bool((apart.abs() <= most).all()) for apart, most in pairs
-        )
+            rows += [(lenses.model, 0), (lenses.coefficients, SAME_CAMERA), (lenses.skew, room)]
+        return all(bool(((each - each[0]).abs() <= most).all()) for each, most in rows)
 
     def lens(self, index: int) -> Lenses | None:
         """The lens of image ``index`` alone; None for a pinhole."""

@@ -108,17 +108,16 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
-    from xplanes.tools.render import VideoOptions, check_out, render_video
+    from xplanes.tools.render import VideoOptions, render_video
 
-    wanted = _filled(VideoOptions, options).written_to(options.out)
+    wanted = _filled(VideoOptions, options)
     wanted.check()
-    check_out(options.out, wanted)
     trained = _load(options)
     height, width = wanted.shape(trained.scene.splits)
     written = "as in the file" if wanted.cameras is not None else "back-and-forth"
     camera = f"{options.path} camera, time {wanted.time or written}"
     say(f"frames      {wanted.count} of {width}x{height} px, {options.what}, {camera}\n")
-    say(f"wrote {render_video(trained, wanted, options.out)}")
+    say(f"wrote {render_video(trained, wanted)}")
 
 
 def _view(options: argparse.Namespace) -> None:

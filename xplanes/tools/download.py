@@ -5,7 +5,6 @@ import shutil
 import time
 import zipfile
 import zlib
-from collections.abc import Callable
 from http.client import HTTPException, HTTPResponse
 from pathlib import Path, PurePosixPath
 from urllib.error import HTTPError, URLError
@@ -13,6 +12,7 @@ from urllib.request import Request, urlopen
 
 from xplanes.errors import SceneError
 from xplanes.files import storage_errors
+from xplanes.process import say
 
 CHUNK_BYTES = 1 << 20
 TIMEOUT_SECONDS = 30
@@ -23,8 +23,6 @@ SPACE = 2.1
 """Free space needed for the archive, in multiples of its size: its images hardly compress, so
 unpacking takes the same space again."""
 
-Announce = Callable[[str], None]
-
 
 class FetchError(Exception):
     """A file could not be downloaded; the message is the reason."""
@@ -34,7 +32,7 @@ class _BrokenTransferError(Exception):
     """The transfer was interrupted; another attempt may succeed."""
 
 
-def fetch(url: str, path: Path, announce: Announce) -> None:
+def fetch(url: str, path: Path) -> None:
     """Download ``url`` to ``path``; an incomplete download is kept in ``path``.part.
 
     Another call resumes an interrupted download, if the server still has the same file (compared by
@@ -43,7 +41,6 @@ def fetch(url: str, path: Path, announce: Announce) -> None:
     Args:
         url: Address, http or https.
         path: The file, which is written atomically.
-        announce: Receives progress messages.
 
     Raises:
         FetchError: The server cannot be reached or refuses, or the disk is too full.
@@ -53,13 +50,13 @@ def fetch(url: str, path: Path, announce: Announce) -> None:
     part = path.with_name(f"{path.name}.part")
     for attempt in range(ATTEMPTS):
         try:
-            _advance(url, part, announce)
+            _advance(url, part)
         except _BrokenTransferError as problem:
             unreachable = attempt == 0 and isinstance(problem.__cause__, URLError)
             if unreachable or attempt == ATTEMPTS - 1:
                 kept = f" {_size(part)} MB are kept in {part}." if part.exists() else ""
                 raise FetchError(f"{problem}.{kept}") from problem
-            announce(f"{problem}; trying again")
+            say(f"{problem}; trying again")
             time.sleep(PAUSE_SECONDS)
         else:
             part.replace(path)
@@ -67,7 +64,7 @@ def fetch(url: str, path: Path, announce: Announce) -> None:
             return
 
 
-def _advance(url: str, part: Path, announce: Announce) -> None:
+def _advance(url: str, part: Path) -> None:
     """Download the rest of ``part``, or all of it if it cannot be resumed."""
     validator = _saved_validator(url, part)
     start = part.stat().st_size if validator else 0
@@ -92,7 +89,7 @@ def _advance(url: str, part: Path, announce: Announce) -> None:
             if not begins or _validator(response) not in (None, validator):
                 _discard(part)
                 raise _BrokenTransferError(f"{url} has changed since the download began")
-            announce(f"Continuing {url} after {_size(part)} MB")
+            say(f"Continuing {url} after {_size(part)} MB")
         else:
             if response.headers.get_content_type() == "text/html":  # ``part`` is kept.
                 raise FetchError(f"{url} answered with a web page instead of a file.")
@@ -101,10 +98,10 @@ def _advance(url: str, part: Path, announce: Announce) -> None:
             _discard(part)
             note = {"url": url, "validator": _validator(response)}
             _note_path(part).write_text(json.dumps(note), encoding="utf-8")
-        _receive(url, response, part, start, announce)
+        _receive(url, response, part, start)
 
 
-def _receive(url: str, response: HTTPResponse, part: Path, start: int, announce: Announce) -> None:
+def _receive(url: str, response: HTTPResponse, part: Path, start: int) -> None:
     total = None if response.length is None else start + response.length
     if total is not None:
         check_space(part.parent, int(SPACE * total) - start)
@@ -124,7 +121,7 @@ def _receive(url: str, response: HTTPResponse, part: Path, start: int, announce:
             if time.monotonic() - reported > PROGRESS_SECONDS:
                 reported = time.monotonic()
                 of_total = f" of {total / 1e6:.0f}" if total else ""
-                announce(f"{received / 1e6:.0f}{of_total} MB")
+                say(f"{received / 1e6:.0f}{of_total} MB")
     # Python returns an empty chunk if the connection ends early.
     if total is not None and received < total:
         raise _BrokenTransferError(
@@ -198,12 +195,7 @@ TEST_VIEWS = 20
 SPLITS = ("train", "val", "test")
 
 
-def download_dnerf(
-    root: Path,
-    *,
-    url: str = DNERF_URL,
-    announce: Announce = print,
-) -> Path:
+def download_dnerf(root: Path, *, url: str = DNERF_URL) -> Path:
     """Download the eight D-NeRF scenes into ``root``; incomplete scenes are never left there.
 
     The next call resumes an interrupted download. Existing scenes are not changed. An archive that
@@ -212,7 +204,6 @@ def download_dnerf(
     Args:
         root: Folder for one folder per scene; created if missing.
         url: Address of the archive.
-        announce: Receives progress messages.
 
     Returns:
         The folder of the scenes, which is the value for data.root.
@@ -223,14 +214,14 @@ def download_dnerf(
     """
     root = Path(root).absolute()
     with storage_errors(root):
-        _download_missing(root, url, announce)
+        _download_missing(root, url)
     return root
 
 
-def _download_missing(root: Path, url: str, announce: Announce) -> None:
+def _download_missing(root: Path, url: str) -> None:
     missing = [name for name in TRAIN_VIEWS if not (root / name / "transforms_train.json").exists()]
     if not missing:
-        announce(f"All D-NeRF scenes are already in {root}")
+        say(f"All D-NeRF scenes are already in {root}")
         return
     for name in missing:
         if (root / name).exists():
@@ -243,11 +234,11 @@ def _download_missing(root: Path, url: str, announce: Announce) -> None:
     by_hand = archive.exists()
     try:
         if by_hand:
-            announce(f"Using {archive}, which is already there")
+            say(f"Using {archive}, which is already there")
         else:
-            announce(f"Downloading {url} to {archive}")
-            fetch(url, archive, announce)
-        _install(archive, root, missing, announce)
+            say(f"Downloading {url} to {archive}")
+            fetch(url, archive)
+        _install(archive, root, missing)
     except FetchError as problem:
         raise SceneError(
             f"{problem} Try again later to continue; or fetch {DNERF_URL} by hand, save it as "
@@ -262,21 +253,21 @@ def _download_missing(root: Path, url: str, announce: Announce) -> None:
         ) from problem
     if not by_hand:
         archive.unlink()
-    announce(f"Scenes in {root}: {', '.join(sorted(TRAIN_VIEWS))}")
+    say(f"Scenes in {root}: {', '.join(sorted(TRAIN_VIEWS))}")
 
 
 class _BadArchiveError(Exception):
     """The archive is damaged or not the expected one."""
 
 
-def _install(archive: Path, root: Path, names: list[str], announce: Announce) -> None:
+def _install(archive: Path, root: Path, names: list[str]) -> None:
     """Unpack into a temporary folder, check all scenes, and only then move them into place."""
     workspace = root / ".dnerf-unpacking"
     shutil.rmtree(workspace, ignore_errors=True)
     try:
         _unpack(archive, workspace, names)
         for name in names:
-            _check_scene(workspace / name, announce)
+            _check_scene(workspace / name)
         for name in names:
             (workspace / name).rename(root / name)
     finally:
@@ -307,7 +298,7 @@ def _target(member: str) -> PurePosixPath | None:
     return PurePosixPath(*parts) if len(parts) > 1 and parts[0] in TRAIN_VIEWS else None
 
 
-def _check_scene(folder: Path, announce: Announce) -> None:
+def _check_scene(folder: Path) -> None:
     """Compare an unpacked scene with the known contents of the data set."""
     name = folder.name
     for split in SPLITS:
@@ -327,4 +318,4 @@ def _check_scene(folder: Path, announce: Announce) -> None:
             )
         # The number of test views is not certain, so a difference is no error.
         if split == "test" and len(files) != TEST_VIEWS:
-            announce(f"Note: {name} has {len(files)} test views; {TEST_VIEWS} are usual")
+            say(f"Note: {name} has {len(files)} test views; {TEST_VIEWS} are usual")

@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from xplanes.fields.base import SurfaceField, ViewDependentField
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES, XPlanes
 from xplanes.files import replacing, require_empty, require_writable, write_json
 from xplanes.optional import require
+from xplanes.process import say
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.box import ray_box
 from xplanes.rendering.grid_renderer import GridRenderer
@@ -140,20 +140,13 @@ def export_times(text: str) -> list[float]:
     return times
 
 
-def export(
-    trained: TrainedRun,
-    options: ExportOptions,
-    out: Path | None = None,
-    *,
-    say: Callable[[str], None],
-) -> Path:
+def export(trained: TrainedRun, options: ExportOptions, out: Path | None = None) -> Path:
     """Export a run for other programs, and list the files in ``export.json``.
 
     Args:
         trained: The run.
         options: Content and format of the export.
         out: Folder to write into, empty or new; ``export/WHAT`` in the run directory when None.
-        say: Receives progress messages.
 
     Returns:
         The folder.
@@ -181,17 +174,13 @@ def export(
             say(f"left out    {facts['left_out']}; --what planes exports it")
         several = WEB_TIMES if options.what == "web" else TIMES
         times = export_times(options.times or str(1 if trained.is_static else several))
-        facts |= {"times": times} | _write_times(folder, trained, options, times, say)
+        facts |= {"times": times} | _write_times(folder, trained, options, times)
     write_json(folder / "export.json", facts)
     return folder
 
 
 def _write_times(
-    folder: Path,
-    trained: TrainedRun,
-    options: ExportOptions,
-    times: list[float],
-    say: Callable[[str], None],
+    folder: Path, trained: TrainedRun, options: ExportOptions, times: list[float]
 ) -> dict[str, Any]:
     """Write the files that depend on time; return their entries of ``export.json``."""
     paths = [folder / f"{options.what}_{number:04d}" for number in range(len(times))]
@@ -202,7 +191,7 @@ def _write_times(
     if threshold is not None:
         say(f"threshold   density {threshold:.4g}")
     if options.what == "web":
-        return _write_web(folder, trained, options, threshold, times, say)
+        return _write_web(folder, trained, options, threshold, times)
     files = [path.with_suffix(f".{options.form}") for path in paths]
     count = None if options.what == "mesh" else options.count or POINTS
     shown = tqdm(times, "times", leave=False, delay=2, disable=None)
@@ -295,7 +284,6 @@ def _write_web(
     options: ExportOptions,
     threshold: float | None,
     times: list[float],
-    say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Write the web page with all timesteps; return its entries of ``export.json``."""
     field = trained.module.field

@@ -3,7 +3,6 @@
 import json
 import re
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from xplanes import __version__
 from xplanes.errors import ConfigError
 from xplanes.files import read_json
 from xplanes.lrm.weights import answers
+from xplanes.process import say
 from xplanes.tools.runs import OUTPUTS, is_run
 from xplanes.training.record import read_config
 
@@ -34,7 +34,6 @@ def push(
     repository: str,
     *,
     private: bool = False,
-    say: Callable[[str], None],
     endpoint: str | None = None,
 ) -> str:
     """Upload a run with a model card.
@@ -43,7 +42,6 @@ def push(
         run: The run directory.
         repository: USER/REPOSITORY; created if it does not exist.
         private: Whether a new repository is private.
-        say: Receives progress messages.
         endpoint: Address of the hub; the default when None.
 
     Returns:
@@ -96,7 +94,6 @@ def push(
 def fetch(
     address: str,
     *,
-    say: Callable[[str], None],
     outputs: Path = OUTPUTS,
     endpoint: str | None = None,
 ) -> Path:
@@ -104,7 +101,6 @@ def fetch(
 
     Args:
         address: hf://USER/REPOSITORY, optionally with @REVISION.
-        say: Receives a message before a download.
         outputs: Folder of runs; the run is saved in its subfolder hub/USER/REPOSITORY.
         endpoint: Address of the hub; the default when None.
 

@@ -95,8 +95,9 @@ def estimated(
     final = data.scene.splits[data.test_split]
     views = data.scene.splits[data.validation_split or data.test_split]
     at = experiment.callbacks.get("evaluation", {}).get("at", [])
+    # A number of views, or a share of them.
     limit = affordable(trainer.get("limit_val_batches", 1.0), views)
-    count = scored_views(limit, len(views))
+    count = min(limit, len(views)) if isinstance(limit, int) else int(limit * len(views))
     pixels = views.height * views.width * count
     steps_at = [share * train / expected.step if share else 0.0 for share in {*at, 1.0}]
     images = sum(pixels * expected.ray(step) for step in steps_at)
@@ -108,11 +109,6 @@ def estimated(
     if train == math.inf:
         return parts.format("no end")
     return f"{spent + train + images:.0f} s in all: {parts.format(f'{train:.0f} s')}"
-
-
-def scored_views(limit: float, views: int) -> int:
-    """Validation views per evaluation; ``trainer.limit_val_batches`` is a number or a share."""
-    return min(limit, views) if isinstance(limit, int) else int(limit * views)
 
 
 def summary(

@@ -173,7 +173,7 @@ def export(trained: TrainedRun, options: ExportOptions, out: Path | None = None)
             facts["left_out"] = "the background outside of the field's cube"
             say(f"left out    {facts['left_out']}; --what planes exports it")
         several = WEB_TIMES if options.what == "web" else TIMES
-        times = export_times(options.times or str(1 if trained.is_static else several))
+        times = export_times(options.times or str(several if field.moves else 1))
         facts |= {"times": times} | _write_times(folder, trained, options, times)
     write_json(folder / "export.json", facts)
     return folder

@@ -51,6 +51,7 @@ def push(
         ConfigError: If the run has no checkpoint or no metrics, or the hub refuses.
     """
     from huggingface_hub import CommitOperationAdd, HfApi, constants
+    from huggingface_hub.utils import filter_repo_objects
 
     repository, revision = _parsed(repository)
     if revision is not None:
@@ -60,12 +61,9 @@ def push(
     for needed in ("checkpoints/last.ckpt", "metrics.json", "run.json"):
         if not (run / needed).is_file():
             raise ConfigError(f"{run} has no {needed}: push a run that has finished")
-    contents: dict[str, Path | bytes] = {
-        path.relative_to(run).as_posix(): path
-        for pattern in PATTERNS
-        for path in sorted(run.glob(pattern.replace("media/*", "media/**/*")))
-        if path.is_file()
-    }
+    files = [path.relative_to(run).as_posix() for path in run.rglob("*") if path.is_file()]
+    wanted = filter_repo_objects(sorted(files), allow_patterns=list(PATTERNS))
+    contents: dict[str, Path | bytes] = {name: run / name for name in wanted}
     record = read_json(run / "run.json")
     record = {name: value for name, value in record.items() if name not in PRIVATE}
     contents["run.json"] = json.dumps(record, indent=2).encode()
@@ -91,12 +89,7 @@ def push(
     return f"{api.endpoint}/{repository}"
 
 
-def fetch(
-    address: str,
-    *,
-    outputs: Path = OUTPUTS,
-    endpoint: str | None = None,
-) -> Path:
+def fetch(address: str, *, outputs: Path = OUTPUTS, endpoint: str | None = None) -> Path:
     """Download a run, or the files that have changed since its last download.
 
     Args:

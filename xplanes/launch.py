@@ -166,11 +166,7 @@ def _job(config: DictConfig) -> float:
 
 
 def _require_same_job(folder: Path, overrides: Iterable[str]) -> None:
-    """Refuse to resume a sweep's job in a folder that holds the run of another job.
-
-    Raises:
-        ConfigError: With the settings of that run.
-    """
+    """Refuse to resume a sweep's job in a folder that holds the run of another job."""
     try:
         kept = (folder / "overrides.txt").read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
@@ -270,11 +266,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
 
 
 def _require_present_names(arguments: Sequence[str], *, several: bool) -> None:
-    """Refuse options of earlier versions, and name those that replace them.
-
-    Raises:
-        ConfigError: With the command that replaces them.
-    """
+    """Refuse options of earlier versions, and name those that replace them."""
     former, now = [], []
     for text in arguments:
         key, value = text.partition("=")[::2]

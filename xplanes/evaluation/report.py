@@ -236,47 +236,47 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
         scores += f"  of the object {test['psnr_foreground']:.2f}"
     if "floaters" in test:
         scores += f"  floaters {100 * test['floaters']:.2f}%"
-    warnings = []
+    lines = [
+        f"\n{metrics['split']:<9}{scores}  over {len(metrics['views'])} views, step "
+        f"{metrics['step']}"
+    ]
     if test["psnr"] < blank + LITTLE:
-        warnings.append(
+        lines.append(
             f"warning  hardly better than images of background alone ({blank:.2f} dB): this run "
             "shows nothing yet"
         )
     if (share := test.get("floaters", 0)) > CLUTTERED:
-        warnings.append(
+        lines.append(
             f"warning  {100 * share:.0f}% of the background is not empty (floaters): train longer, "
             "or check the cameras and times; content that\n         is too thin or too fast for "
             "the views shows up as floaters as well"
         )
-    place = shlex.quote(str(run))
-    named = "".join(f" --plugin {name}" for name in experiment.config.get("plugins") or [])
-    curves = [f"tensorboard --logdir {place}"] * any(run.rglob("events.out.tfevents.*"))
-    skips = (
-        f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "
-        f"{100 * skipped['occluded']:.0f}% behind surfaces, "
-        f"{100 * skipped['background']:.0f}% of pixels as background; "
-        f"{metrics['samples_per_ray']:.1f} samples a ray remained"
-    )
-    # Without callbacks.checkpoints there is nothing to render or to resume.
-    kept = "checkpoints/last.ckpt  " if (run / "checkpoints" / LAST).is_file() else ""
-    steps = [*curves, f"xplanes render {place}{named}", resume_command(run) + more]
-    steps = steps if kept else curves
-    warm_up = f"compiling {seconds['warm_up']:.1f} s · " if seconds["warm_up"] >= 1 else ""
-    moved = []
     if (cameras := metrics.get("cameras")) is not None:
-        moved.append(
+        lines.append(
             f"cameras  moved by {cameras['mean_px']:.2f} px on average, at most by "
             f"{cameras['most_px']:.2f} px ({cameras['farthest']}); poses in metrics.json"
         )
-    lines = [
-        f"\n{metrics['split']:<9}{scores}  over {len(metrics['views'])} views, step "
-        f"{metrics['step']}",
-        *warnings,
-        *moved,
+    warm_up = f"compiling {seconds['warm_up']:.1f} s · " if seconds["warm_up"] >= 1 else ""
+    lines.append(
         f"time     prepare {sum(seconds['prepare'].values()):.1f} s + train "
         f"{seconds['train']:.1f} s · {warm_up}scoring {seconds['evaluate']:.1f} s · "
-        f"{seconds['total']:.1f} s in all · {metrics['rays_per_second'] / 1000:.1f}k rays/s",
-        *([skips] if metrics["samples_per_ray"] else []),
+        f"{seconds['total']:.1f} s in all · {metrics['rays_per_second'] / 1000:.1f}k rays/s"
+    )
+    if metrics["samples_per_ray"]:
+        lines.append(
+            f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "
+            f"{100 * skipped['occluded']:.0f}% behind surfaces, "
+            f"{100 * skipped['background']:.0f}% of pixels as background; "
+            f"{metrics['samples_per_ray']:.1f} samples a ray remained"
+        )
+    place = shlex.quote(str(run))
+    steps = [f"tensorboard --logdir {place}"] * any(run.rglob("events.out.tfevents.*"))
+    kept = ""
+    if (run / "checkpoints" / LAST).is_file():  # Else there is nothing to render or to resume.
+        kept = "checkpoints/last.ckpt  "
+        named = "".join(f" --plugin {name}" for name in experiment.config.get("plugins") or [])
+        steps += [f"xplanes render {place}{named}", resume_command(run) + more]
+    lines += [
         f"memory   {metrics['peak_memory_bytes'] / 2**30:.1f} GB at its peak",
         f"wrote    {run}",
         f"         metrics.json  curve.csv  {kept}{metrics.get('media', '')}",

@@ -208,12 +208,7 @@ def _write_times(
 
 
 def _threshold(trained: TrainedRun, options: ExportOptions, times: list[float]) -> float | None:
-    """Density of the surface; None if the field defines a surface or points itself.
-
-    Raises:
-        ConfigError: If the field has none of these, or a threshold is given but not used.
-        MissingExtraError: For a surface without the extra ``export``.
-    """
+    """Density of the surface; None if the field defines a surface or points itself."""
     field, threshold = trained.module.field, options.threshold
     if options.what == "web" and field.cloud(times[0]) is not None:
         own = "points of its own"

@@ -71,8 +71,8 @@ class _Sheet:
         places = [(SCALE * x, SCALE * y) for x, y in points]
         self.pen.line(places, fill=colour, width=max(1, round(SCALE * width)), joint="curve")
 
-    def box(self, box: Box, fill: str | None = None, outline: str | None = None) -> None:
-        self.pen.rectangle([SCALE * value for value in box], fill=fill, outline=outline)
+    def box(self, box: Box, fill: str) -> None:
+        self.pen.rectangle([SCALE * value for value in box], fill=fill)
 
     def dot(self, place: tuple[float, float], radius: float, colour: str) -> None:
         x, y = place

@@ -225,14 +225,12 @@ def _status(record: dict[str, Any] | None, metrics: dict[str, Any] | None) -> st
 
 
 def _scores(metrics: dict[str, Any]) -> dict[str, float]:
-    found = {}
+    flat, found = flatten(metrics), {}
     for name, score in SCORES.items():
-        value: Any = metrics
-        for key in score.place.split("."):
-            value = value.get(key) if isinstance(value, dict) else None
-        parts = list(value.values()) if isinstance(value, dict) else [value]
+        # A score may be the sum of several numbers, such as the seconds of all stages.
+        parts = [flat[key] for key in flat if f"{key}.".startswith(f"{score.place}.")]
         if parts and all(map(is_number, parts)):
-            found[name] = sum(parts) if isinstance(value, dict) else value
+            found[name] = sum(parts)
     return found
 
 

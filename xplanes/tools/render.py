@@ -69,9 +69,9 @@ class VideoOptions:
     out: str | None = None
 
     def __post_init__(self) -> None:
-        image = self.out is not None and Path(self.out).suffix in IMAGES
-        one = image and self.frames in (None, 1) and not Path(self.out or "").is_dir()
-        if one and self.path.startswith("view:") and self.time is None:
+        out = Path(self.out or "")
+        one_image = out.suffix in IMAGES and not out.is_dir() and self.frames in (None, 1)
+        if one_image and self.path.startswith("view:") and self.time is None:
             object.__setattr__(self, "time", OWN)
 
     @cached_property

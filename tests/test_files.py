@@ -15,7 +15,7 @@ from xplanes.files import (
     read_json,
     replacing,
     require_writable,
-    storage_error,
+    storage_errors,
     write_json,
     write_text,
 )
@@ -61,8 +61,13 @@ def test_a_disk_that_refuses_is_said_with_a_message(tmp_path, code, words):
 
 
 def test_other_problems_are_not_the_disk_s(tmp_path):
-    assert storage_error(ConnectionRefusedError(errno.ECONNREFUSED, "refused")) is None
-    assert storage_error(PermissionError(errno.EACCES, "denied", "weights.ckpt")) is None
+    for problem in (
+        ConnectionRefusedError(errno.ECONNREFUSED, "refused"),
+        PermissionError(errno.EACCES, "denied", "weights.ckpt"),
+    ):
+        with pytest.raises(OSError, match=str(problem.strerror)) as caught, storage_errors():
+            raise problem
+        assert caught.value is problem
     with pytest.raises(OSError, match="power cut") as caught:
         begin(tmp_path / "a", OSError("power cut"))
     assert not isinstance(caught.value, StorageError)

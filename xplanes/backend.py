@@ -57,9 +57,19 @@ class WarmUp:
 warm_up = WarmUp()
 
 
+CONSEQUENCES = {
+    "numba": "PyTorch computes the same on the CPU, several times more slowly. "
+    "To install it: `pip install --upgrade numba`.",
+    "triton": "PyTorch computes the same on the GPU, more slowly. "
+    "To install it: `pip install --upgrade triton` (PyTorch for CUDA on Linux includes it).",
+}
+"""What follows if a package is missing, and the remedy."""
+
+
 @functools.cache
-def _found(package: str, consequence: str) -> bool:
+def _found(package: str) -> bool:
     """Whether a package can be imported; logs the consequence once if not."""
+    consequence = CONSEQUENCES[package]
     if importlib.util.find_spec(package) is None:
         logger.warning("%s is not installed: %s", package, consequence)
         return False
@@ -74,33 +84,20 @@ def _found(package: str, consequence: str) -> bool:
     return True
 
 
-def numba_found() -> bool:
-    """Whether the compiled CPU loops can be used; logs once if not."""
-    return _found(
-        "numba",
-        "PyTorch computes the same on the CPU, several times more slowly. "
-        "To install it: `pip install --upgrade numba`.",
-    )
-
-
 def cpu_loops(tensor: Tensor) -> bool:
     """Whether compiled CPU loops apply to ``tensor``: on the CPU, in float32 or float64."""
     return (
         tensor.device.type == "cpu"
         and tensor.dtype in (torch.float32, torch.float64)
         and os.environ.get("XPLANES_CPU_LOOPS", "1") != "0"
-        and numba_found()
+        and _found("numba")
     )
 
 
 def triton_found() -> bool:
-    """Whether triton is installed; logs once if not."""
+    """Whether triton can be used; logs once if not."""
     _settle_triton()
-    return _found(
-        "triton",
-        "PyTorch computes the same on the GPU, more slowly. "
-        "To install it: `pip install --upgrade triton` (PyTorch for CUDA on Linux includes it).",
-    )
+    return _found("triton")
 
 
 @functools.cache

@@ -134,9 +134,6 @@ def _logger(name: str, node: Mapping[str, Any], run: Path) -> Logger:
 
     TensorBoardLogger passes unknown arguments on to its writer, which rejects them only when the
     first curve is written. They are rejected here instead.
-
-    Raises:
-        ConfigError: If it rejects its arguments.
     """
     key = f"logger.{name}"
     cls = class_of(node.get("_target_"), Logger, f"{key}._target_")

@@ -10,7 +10,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,25 +27,27 @@ class StorageError(XPlanesError, OSError):
     """A file cannot be written; the message names the file, the reason and the remedy."""
 
 
-def storage_error(problem: OSError, path: Path | None = None) -> StorageError | None:
-    """The error to report for a disk problem; None for any other problem.
+@contextmanager
+def storage_errors(path: Path | None = None) -> Iterator[None]:
+    """Report problems of the disk within the block as `StorageError`; others pass unchanged.
 
     Args:
-        problem: The original error.
-        path: The file to be written; when None, the one that ``problem`` names.
+        path: The file to be written; when None, the one that the original error names.
     """
-    way_out = _WAYS_OUT.get(problem.errno or 0)
-    if way_out is None or (path is None and problem.errno not in _ONLY_WRITING):
-        return None
-    place = path if path is not None else Path(problem.filename or "a file")
-    room = ""
-    if problem.errno in (errno.ENOSPC, errno.EDQUOT):
-        try:
-            room = f" ({shutil.disk_usage(existing(place)).free / 2**20:.1f} MB free)"
-        except OSError:
-            room = ""
-    reason = os.strerror(problem.errno or 0)
-    return StorageError(f"{place} cannot be written: {reason}{room}. {way_out}")
+    try:
+        yield
+    except OSError as problem:
+        code = problem.errno or 0
+        if code not in _WAYS_OUT or (path is None and code not in _ONLY_WRITING):
+            raise
+        place = path if path is not None else Path(problem.filename or "a file")
+        room = ""
+        if code in (errno.ENOSPC, errno.EDQUOT):
+            with suppress(OSError):
+                room = f" ({shutil.disk_usage(existing(place)).free / 2**20:.1f} MB free)"
+        raise StorageError(
+            f"{place} cannot be written: {os.strerror(code)}{room}. {_WAYS_OUT[code]}"
+        ) from problem
 
 
 _FREE = "Free some space, or choose a folder on another disk; existing files are intact"
@@ -116,15 +118,11 @@ def require_writable(folder: Path) -> None:
         StorageError: If no file can be written.
     """
     place = existing(folder.absolute())
-    try:
+    with storage_errors(folder):
         if not place.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, "", str(place))
         with tempfile.TemporaryFile(dir=place) as file:
             file.write(bytes(1 << 16))
-    except OSError as problem:
-        if (words := storage_error(problem, folder)) is None:
-            raise
-        raise words from problem
 
 
 def require_empty(folder: Path) -> None:
@@ -146,24 +144,19 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
         StorageError: If the disk is full, cannot be written, or fails.
     """
-    temporary = None
-    try:
+    with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         prefix = f".{path.name}{MARK}"
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=path.suffix)
         os.close(handle)
         temporary = Path(name)
-        yield temporary
-        with temporary.open("r+b") as file:  # Windows syncs only files open for writing.
-            os.fsync(file.fileno())
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    except OSError as problem:
-        if (words := storage_error(problem, path)) is None:
-            raise
-        raise words from problem
-    finally:
-        if temporary is not None:
+        try:
+            yield temporary
+            with temporary.open("r+b") as file:  # Windows syncs only files open for writing.
+                os.fsync(file.fileno())
+            temporary.chmod(0o644)
+            temporary.replace(path)
+        finally:
             temporary.unlink(missing_ok=True)
 
 
@@ -175,11 +168,9 @@ def clear_unfinished(folder: Path, older_than: float = 0.0) -> None:
         older_than: Least age in seconds of removed files; newer ones may still be in use.
     """
     for path in folder.rglob(f".*{MARK}*"):
-        try:
+        with suppress(OSError):  # Another process has removed it, or the folder is read-only.
             if path.is_file() and time.time() - path.stat().st_mtime >= older_than:
                 path.unlink()
-        except OSError:
-            continue  # Another process has removed it, or the folder is read-only.
 
 
 def write_text(path: Path, text: str) -> None:

@@ -6,6 +6,7 @@ For a fast start, neither torch nor lightning is imported before the job begins.
 import shlex
 import sys
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -165,11 +166,7 @@ def _job(config: DictConfig) -> float:
 
 
 def _require_same_job(folder: Path, overrides: Iterable[str]) -> None:
-    """Refuse to resume a sweep's job in a folder that holds the run of another job.
-
-    Raises:
-        ConfigError: With the settings of that run.
-    """
+    """Refuse to resume a sweep's job in a folder that holds the run of another job."""
     try:
         kept = (folder / "overrides.txt").read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
@@ -204,7 +201,8 @@ def prepare(arguments: list[str]) -> list[str]:
         StorageError: If the folder of the run cannot be written.
     """
     require_readable(arguments)
-    several = _is_multirun(arguments)
+    mode = dict(map(key_and_value, arguments)).get("hydra.mode")
+    several = mode == "MULTIRUN" or not {"-m", "--multirun"}.isdisjoint(arguments)
     _require_present_names(arguments, several=several)
     arguments = [with_names(text, several=several) for text in arguments]
     require_parsed([text for text in arguments if key_and_value(text)[0]])
@@ -222,7 +220,7 @@ def prepare(arguments: list[str]) -> list[str]:
         if resume != "auto" or several:
             return arguments
         own = [a for a in arguments if not a.startswith("resume=")]
-        found = Path(folder) if folder else _latest(Path("outputs"), own)
+        found = Path(folder) if folder else _latest(own)
         if found is None or not (found / "run.json").is_file():
             print("resume=auto: no unfinished run with these settings, so a new one begins")
             return [*own, "resume=null"]
@@ -241,7 +239,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     """A run's overrides, the new ones that replace or extend them, and its folder."""
     path = run / "overrides.txt"
     if not path.is_file():
-        found = _newest(Path("outputs"), "overrides.txt")
+        found = _newest("overrides.txt")
         newest = ", ".join(str(each.parent) for each in found[:3]) or "there is none in outputs"
         raise ConfigError(
             f"resume={run}: not a run directory, no overrides.txt in it. The newest runs: {newest}"
@@ -268,11 +266,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
 
 
 def _require_present_names(arguments: Sequence[str], *, several: bool) -> None:
-    """Refuse options of earlier versions, and name those that replace them.
-
-    Raises:
-        ConfigError: With the command that replaces them.
-    """
+    """Refuse options of earlier versions, and name those that replace them."""
     former, now = [], []
     for text in arguments:
         key, value = text.partition("=")[::2]
@@ -305,18 +299,15 @@ def _require_version(run: Path) -> None:
         )
 
 
-def _latest(outputs: Path, overrides: list[str]) -> Path | None:
+def _latest(overrides: list[str]) -> Path | None:
     """The newest unfinished run with the same overrides."""
     wanted = _without_resume(overrides)
-    for record in _newest(outputs, "run.json"):
+    for record in _newest("run.json"):
         listed = record.parent / "overrides.txt"
-        try:
-            done = read_json(record).get("status") == "finished"
+        with suppress(OSError, ValueError):
             same = _without_resume(listed.read_text(encoding="utf-8").splitlines()) == wanted
-        except (OSError, ValueError):
-            continue
-        if same and not done:
-            return record.parent
+            if same and read_json(record).get("status") != "finished":
+                return record.parent
     return None
 
 
@@ -327,12 +318,7 @@ def _without_resume(overrides: Iterable[str]) -> list[str]:
     return sorted(t for t, key in keys.items() if key == SEARCHPATH or key not in left_out)
 
 
-def _newest(outputs: Path, name: str) -> list[Path]:
+def _newest(name: str) -> list[Path]:
     """Files called ``name`` in run directories, newest first."""
-    return sorted(outputs.glob(f"*/{name}"), key=lambda p: p.stat().st_mtime, reverse=True)
-
-
-def _is_multirun(arguments: list[str]) -> bool:
-    """Whether Hydra will run several jobs, because of an option or its mode."""
-    mode = dict(map(key_and_value, arguments)).get("hydra.mode")
-    return mode == "MULTIRUN" or not {"-m", "--multirun"}.isdisjoint(arguments)
+    found = Path("outputs").glob(f"*/{name}")
+    return sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)

@@ -20,7 +20,7 @@ from xplanes.evaluation.findings import scene_findings
 from xplanes.evaluation.render import FRAMES, write_orbit
 from xplanes.evaluation.report import closing, header, log_hparams, rest, summary, write_pictures
 from xplanes.experiment import Experiment
-from xplanes.files import StorageError, clear_unfinished, storage_error, write_json
+from xplanes.files import StorageError, clear_unfinished, storage_errors, write_json
 from xplanes.locks import alone_in
 from xplanes.models.initialisation import Place, initialisation_of
 from xplanes.process import resume_command, say
@@ -111,7 +111,7 @@ def run(
         return float("nan")
     claimed = False
     try:
-        with alone_in(folder):
+        with storage_errors(), alone_in(folder):
             claim(folder, resume=resume)
             claimed = True
             if resume and has_checkpoint(folder):
@@ -125,10 +125,6 @@ def run(
             with suppress(OSError):  # The parent folder may hold other runs.
                 folder.parent.rmdir()
         raise
-    except OSError as problem:
-        if (words := storage_error(problem)) is None:
-            raise
-        raise words from problem
 
 
 def _recorded(job: Job, overrides: list[str], *, resume: bool, began: float | None) -> float:

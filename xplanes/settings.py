@@ -185,20 +185,15 @@ def _is_location(hint: Any) -> bool:
 
 def kinds_of(hint: Any) -> tuple[list[Any], list[Range]]:
     """Alternatives of a type hint, and the ranges that it carries."""
-    ranges: list[Range] = []
     if get_origin(hint) is Annotated:
         inner, *extras = get_args(hint)
-        ranges = [extra for extra in extras if isinstance(extra, Range)]
-        kinds, more = kinds_of(inner)
-        return kinds, ranges + more
+        kinds, ranges = kinds_of(inner)
+        return kinds, [extra for extra in extras if isinstance(extra, Range)] + ranges
     if get_origin(hint) in (Union, types.UnionType):
-        kinds = []
-        for part in get_args(hint):
-            found, more = kinds_of(part)
-            kinds += found
-            ranges += more
-        return kinds, ranges
-    return [hint], ranges
+        parts = [kinds_of(part) for part in get_args(hint)]
+        kinds = [kind for found, _ in parts for kind in found]
+        return kinds, [allowed for _, found in parts for allowed in found]
+    return [hint], []
 
 
 def _check(name: str, value: Any, hint: Any) -> None:
@@ -252,11 +247,6 @@ _NAMES = {
 
 
 def _words(kinds: list[Any]) -> str:
-    names = []
-    for kind in kinds:
-        origin = get_origin(kind) or kind
-        if isinstance(origin, type) and is_dataclass(origin):
-            names.append("a mapping")
-        else:
-            names.append(_NAMES.get(origin, str(origin)))
+    origins = [get_origin(kind) or kind for kind in kinds]
+    names = ["a mapping" if is_dataclass(o) else _NAMES.get(o, str(o)) for o in origins]
     return " or ".join(dict.fromkeys(names))

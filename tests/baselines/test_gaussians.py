@@ -374,7 +374,7 @@ def test_a_ply_of_a_timestep_shows_what_the_renderer_shows(tmp_path, degree):
     trimesh = pytest.importorskip("trimesh")
     field = gaussians(40, degree=degree)
     run = trained(field)
-    folder = export(run, ExportOptions("gaussians", times="0.25,0.75"), tmp_path / "out", say=print)
+    folder = export(run, ExportOptions("gaussians", times="0.25,0.75"), tmp_path / "out")
     files = sorted(path.name for path in folder.iterdir())
     assert files == ["export.json", "gaussians_0000.ply", "gaussians_0001.ply"]
     rest = 3 * ((degree + 1) ** 2 - 1)
@@ -428,7 +428,7 @@ def test_the_points_of_a_page_are_the_more_opaque_gaussians(tmp_path):
     assert torch.equal(points[0], posed.means[posed.opacities.argmax()])
     assert set(map(tuple, points.tolist())) == set(map(tuple, posed.means[kept].tolist()))
     assert ((colours >= 0) & (colours <= 1)).all()
-    folder = export(run, ExportOptions("web", times="3"), tmp_path / "web", say=print)
+    folder = export(run, ExportOptions("web", times="3"), tmp_path / "web")
     listed = json.loads((folder / "export.json").read_text())
     assert (listed["vertices"], listed["triangles"]) == (3 * len(points), 0)
 
@@ -436,11 +436,11 @@ def test_the_points_of_a_page_are_the_more_opaque_gaussians(tmp_path):
 def test_what_does_not_fit_is_refused(tmp_path, scenes):
     field = gaussians(3)
     with pytest.raises(ConfigError, match=r"--what mesh: .* set --what gaussians"):
-        export(trained(field), ExportOptions("mesh", times="2"), tmp_path / "a", say=print)
+        export(trained(field), ExportOptions("mesh", times="2"), tmp_path / "a")
     with pytest.raises(ConfigError, match="frame is rotated"):
         field.exports["gaussians"](tmp_path / "b", 0.0, TURNED)
     with pytest.raises(ConfigError, match=r"--what video: .* has none; set --what .*gaussians"):
-        export(trained(field), ExportOptions("video"), tmp_path / "b", say=print)
+        export(trained(field), ExportOptions("video"), tmp_path / "b")
     assert not list(tmp_path.glob("b*"))
     for model, sampler in (("gaussians_hexplane", "occupancy"), ("six_planes", "rasteriser")):
         overrides = [f"model={model}", f"model/sampler={sampler}", "lrm=none"]

@@ -62,7 +62,7 @@ def transforms(views: Views, **changed: Any) -> dict[str, Any]:
 
 def test_a_frame_is_the_render_from_its_camera_at_its_time(trained, views, tmp_path):
     path = write(tmp_path / "camera_path.json", nerfstudio(views))
-    folder = render_video(trained, VideoOptions(path=str(path)), f"{tmp_path}/frames/")
+    folder = render_video(trained, VideoOptions(str(path), out=f"{tmp_path}/frames/"))
     for index, (fov, time) in enumerate(((40, 0.75), (55, 0.25))):
         focal = 6 / math.tan(math.radians(fov / 2))
         rays = PosedCamera(views.camera_to_world[index], focal, 12, 20).rays()

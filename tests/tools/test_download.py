@@ -9,6 +9,7 @@ from collections import namedtuple
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import product
+from unittest.mock import patch
 
 import pytest
 
@@ -113,7 +114,8 @@ def server(archive, monkeypatch):
 
 def download(root, server, **arguments):
     lines = []
-    result = download_dnerf(root, url=server.url, announce=lines.append, **arguments)
+    with patch.object(download_module, "say", lines.append):
+        result = download_dnerf(root, url=server.url, **arguments)
     return result, lines
 
 
@@ -352,7 +354,7 @@ def test_a_web_page_in_between_keeps_what_was_fetched(tmp_path, server, monkeypa
     assert_complete(tmp_path)
 
 
-def test_a_disk_that_refuses_is_said_in_words(tmp_path, server):
+def test_a_disk_that_refuses_is_said_in_words(tmp_path, server, monkeypatch):
     (tmp_path / "file").write_text("")
     for root in (tmp_path / "file", tmp_path / "file" / "deeper"):
         with pytest.raises(StorageError, match="A file stands where a folder should be"):
@@ -362,5 +364,6 @@ def test_a_disk_that_refuses_is_said_in_words(tmp_path, server):
         if line.startswith("Downloading"):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
+    monkeypatch.setattr(download_module, "say", full)
     with pytest.raises(StorageError, match=r"cannot be written: No space left.*Free some space"):
-        download_dnerf(tmp_path / "root", url=server.url, announce=full)
+        download_dnerf(tmp_path / "root", url=server.url)

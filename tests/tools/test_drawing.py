@@ -106,7 +106,7 @@ def test_modes_show_colour_depth_and_opacity():
     renderer = grid_renderer()
     wanted = shot()
     assert (wanted.height, wanted.width) == (SIZE, 36)
-    image = renderer.image(field, *wanted.rays(), 0.0, torch.ones(3))
+    image = renderer.image(field, *wanted.camera.rays(), 0.0, torch.ones(3))
     colour = image["colour"].view(SIZE, 36, 3)
     depth, opacity = (image[name].view(SIZE, 36) for name in ("depth", "opacity"))
     assert 50 < (opacity > 0.5).sum() < 400
@@ -175,7 +175,7 @@ def test_every_renderer_crops(name):
     torch.testing.assert_close(same.colours, whole.colours, atol=1e-3, rtol=0)
     wanted = shot(box=box, mode="opacity")
     opacity = drawn(field, renderer, wanted).colours[..., 0]
-    origins, directions = wanted.rays()
+    origins, directions = wanted.camera.rays()
     places = origins[:, None] + torch.linspace(1, 5, 801)[:, None] * directions[:, None]
     through = in_box(box)(places).any(dim=1).view_as(opacity)
     assert 20 < through.sum() < 600
@@ -193,7 +193,7 @@ def test_bounds_of_the_training_cameras_do_not_cut_the_scene_off():
     free = FixedStepRenderer(field, near=0.01, far=20.0, **options)
     pose = look_at(torch.tensor([[0.0, -distance, 0.0]]))[0]
     wanted = shot(pose=pose, fov=1.5 / distance, mode="opacity")
-    cut = bounded.image(field, *wanted.rays(), 0.0, torch.ones(3))["depth"].view(SIZE, 36)
+    cut = bounded.image(field, *wanted.camera.rays(), 0.0, torch.ones(3))["depth"].view(SIZE, 36)
     found, expected = (drawn(field, renderer, wanted) for renderer in (bounded, free))
     torch.testing.assert_close(found.colours, expected.colours, atol=0.02, rtol=0)
     seen = expected.depth.isfinite() & found.depth.isfinite()

@@ -94,10 +94,6 @@ def set_up(
     return TrainedRun(*content)
 
 
-def quiet(text: str) -> None:
-    """Takes messages."""
-
-
 def silhouettes(trained: TrainedRun, mesh: Any, time: float, pose: Tensor) -> tuple[Tensor, Tensor]:
     """What a mesh in the world covers, and where the field stops half the light. bool [P], [P]"""
     origins, directions = PosedCamera(pose, 1.2 * SIZE, SIZE, SIZE).rays()
@@ -124,7 +120,7 @@ def agreement(first: Tensor, second: Tensor) -> float:
 def test_a_ball_comes_out_where_it_is_in_the_world(tmp_path, form):
     trained, resolution = set_up(tmp_path, Ball(500.0, 0.002)), 40
     options = ExportOptions(times="0,1", resolution=resolution, form=form)
-    folder = export(trained, options, say=quiet)
+    folder = export(trained, options)
     assert folder == trained.path / "export" / "mesh"
     texel = 2 / resolution / FRAME.scale
     listed = json.loads((folder / "export.json").read_text())
@@ -145,7 +141,7 @@ def test_a_ball_comes_out_where_it_is_in_the_world(tmp_path, form):
 @pytest.mark.parametrize("what", ["mesh", "points"])
 def test_glb_files_are_matt_and_leave_the_world_to_a_node(tmp_path, what):
     options = ExportOptions(what, times="0,1", resolution=24, form="glb")
-    folder = export(set_up(tmp_path, Ball(500.0, 0.002)), options, say=quiet)
+    folder = export(set_up(tmp_path, Ball(500.0, 0.002)), options)
     content = (folder / f"{what}_0000.glb").read_bytes()
     tree = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
     (primitive,) = (each for mesh in tree["meshes"] for each in mesh["primitives"])
@@ -159,7 +155,7 @@ def test_glb_files_are_matt_and_leave_the_world_to_a_node(tmp_path, what):
 
 def test_the_silhouette_of_a_mesh_is_that_of_the_field(tmp_path):
     trained = set_up(tmp_path, Ball(6.0, 0.05))
-    folder = export(trained, ExportOptions(times="0.5", resolution=32), say=quiet)
+    folder = export(trained, ExportOptions(times="0.5", resolution=32))
     mesh = trimesh.load(folder / "mesh_0000.ply")
     pose = orbit(5, radius=7, elevation=-35, target=FRAME.centre)[2]
     covered, shown = silhouettes(trained, mesh, 0.5, pose)
@@ -169,7 +165,7 @@ def test_the_silhouette_of_a_mesh_is_that_of_the_field(tmp_path):
 
 def test_colours_of_vertices_are_those_that_the_field_shows_along_normals(tmp_path):
     trained = set_up(tmp_path, Ball())
-    folder = export(trained, ExportOptions(times="0.5", resolution=32), say=quiet)
+    folder = export(trained, ExportOptions(times="0.5", resolution=32))
     mesh = trimesh.load(folder / "mesh_0000.ply")
     points = FRAME.points(torch.tensor(np.asarray(mesh.vertices)).float())
     outward = points - Ball.centre(0.5)
@@ -183,7 +179,7 @@ def test_colours_of_vertices_are_those_that_the_field_shows_along_normals(tmp_pa
 def test_a_point_cloud_lies_on_the_surface(tmp_path):
     trained = set_up(tmp_path, Ball())
     options = ExportOptions(what="points", times="0.5", resolution=40, count=500)
-    cloud = trimesh.load(export(trained, options, say=quiet) / "points_0000.ply")
+    cloud = trimesh.load(export(trained, options) / "points_0000.ply")
     assert cloud.vertices.shape == (500, 3)
     points = FRAME.points(torch.tensor(np.asarray(cloud.vertices)).float())
     outward = points - Ball.centre(0.5)
@@ -232,7 +228,7 @@ def test_the_threshold_is_the_density_of_the_surface(tmp_path, name):
     volume, _ = module.solidity(trained, 0.5, resolution)
     threshold = float(-torch.log1p(-volume[volume > 0]).median()) * resolution / 2
     options = ExportOptions(times="0.5", resolution=resolution, threshold=threshold)
-    mesh = trimesh.load(export(trained, options, say=quiet) / "mesh_0000.ply")
+    mesh = trimesh.load(export(trained, options) / "mesh_0000.ply")
     points = torch.tensor(np.asarray(mesh.vertices)).float()
     low, high = BOX if name == "TiNeuVox" else torch.tensor([[-1.0] * 3, [1.0] * 3])
     points = points[((points > low + 0.05) & (points < high - 0.05)).all(dim=1)]
@@ -247,7 +243,7 @@ def test_a_field_of_signed_distances_gives_its_own_surface(tmp_path):
     field = tensor4d(width=64, filled=False)
     renderer = NeusRenderer(field, samples=8, more=8, coarse_sharpness=64.0)
     trained = set_up(tmp_path, field, renderer)
-    folder = export(trained, ExportOptions(times="0.0", resolution=32), say=quiet)
+    folder = export(trained, ExportOptions(times="0.0", resolution=32))
     mesh = trimesh.load(folder / "mesh_0000.ply")
     points = FRAME.points(torch.tensor(np.asarray(mesh.vertices)).float())
     with torch.no_grad():
@@ -255,7 +251,7 @@ def test_a_field_of_signed_distances_gives_its_own_surface(tmp_path):
     assert float(distance.abs().max()) < 0.03
     assert len(points) > 500
     with pytest.raises(ConfigError, match="--threshold 3: this field has a surface"):
-        export(trained, ExportOptions(threshold=3), tmp_path / "other", say=quiet)
+        export(trained, ExportOptions(threshold=3), tmp_path / "other")
 
 
 def written_reader(name: str = "Planes") -> Any:
@@ -285,7 +281,7 @@ def test_the_documented_reader_gives_the_values_of_the_field(tmp_path, plane_set
     options = {} if plane_set == "six" else options | {"colour_margin": 0.0}
     field = x_planes(plane_set, decoder=Decoder(5, width=16, **options))
     trained = set_up(tmp_path, field)
-    folder = export(trained, ExportOptions(what="planes"), say=quiet)
+    folder = export(trained, ExportOptions(what="planes"))
     world = FRAME.to_world(torch.rand(200, 3) * 2.2 - 1.1)
     times = torch.rand(200)
     colour, density = written_reader()(folder / "planes.safetensors")(world, times)
@@ -304,7 +300,7 @@ def test_the_documented_reader_sees_the_background_of_the_field(tmp_path, sample
         background.planes.mul_(3000)
     field = x_planes("six", decoder=Decoder(5), background=background)
     trained = set_up(tmp_path, field)
-    folder = export(trained, ExportOptions(what="planes"), say=quiet)
+    folder = export(trained, ExportOptions(what="planes"))
     origins, aims = FRAME.to_world(torch.randn(2, 300, 3))
     directions = torch.nn.functional.normalize(aims - origins, dim=1)
     found = written_reader("World")(folder / "planes.safetensors").behind(origins, directions)
@@ -390,16 +386,16 @@ def test_bad_options_are_refused(tmp_path):
 def test_exports_that_cannot_be_are_refused(tmp_path):
     trained, out = set_up(tmp_path, Ball(density=0.1)), tmp_path / "out"
     with pytest.raises(ConfigError, match="no pixel of the training cameras has an opacity"):
-        export(trained, ExportOptions(resolution=16), out, say=quiet)
+        export(trained, ExportOptions(resolution=16), out)
     with pytest.raises(ConfigError, match=r"nowhere above the threshold 5; the largest is 0\.1"):
-        export(trained, ExportOptions(resolution=16, threshold=5.0), out, say=quiet)
+        export(trained, ExportOptions(resolution=16, threshold=5.0), out)
     if out.is_dir():  # The way out, another threshold, finds room there.
         assert not list(out.iterdir())
     with pytest.raises(ConfigError, match="--what planes: some model has no planes"):
-        export(trained, ExportOptions(what="planes"), out, say=quiet)
+        export(trained, ExportOptions(what="planes"), out)
     out.write_text("in the way")
     with pytest.raises(ConfigError, match="is a file"):
-        export(trained, ExportOptions(), out, say=quiet)
+        export(trained, ExportOptions(), out)
 
 
 def test_a_missing_extra_is_named(monkeypatch):

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from tests.tools.browser import browser, canvas_of, needs_browser, until
-from tests.tools.test_export import FRAME, Ball, quiet, set_up
+from tests.tools.test_export import FRAME, Ball, set_up
 from xplanes.cli import main
 from xplanes.errors import ConfigError
 from xplanes.optional import MissingExtraError
@@ -32,7 +32,7 @@ pytest.importorskip("skimage")
 
 def page_of(trained: TrainedRun, out: Path | None = None, **options: Any) -> Path:
     wanted = ExportOptions("web", **{"times": "0,1", "resolution": 24, **options})
-    return export(trained, wanted, out, say=quiet) / "index.html"
+    return export(trained, wanted, out) / "index.html"
 
 
 def content_of(page: Path) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def test_a_page_holds_the_meshes_that_are_exported_as_files(tmp_path):
     trained = set_up(tmp_path, Ball())
     content = content_of(page_of(trained))
     wanted = ExportOptions("mesh", times="0,1", resolution=24)
-    folder = export(trained, wanted, tmp_path / "mesh", say=quiet)
+    folder = export(trained, wanted, tmp_path / "mesh")
     assert content["times"] == [0, 1]
     for number, shape in enumerate(content["shapes"]):
         mesh = trimesh.load(folder / f"mesh_{number:04d}.ply", process=False)
@@ -104,22 +104,22 @@ def test_names_are_text_and_fill_nothing(tmp_path):
     assert "<title>a&lt;b&gt;{{run}}</title>" in text
 
 
-def test_triangles_are_left_out_until_the_page_fits(tmp_path, monkeypatch):
-    trained, said = set_up(tmp_path, Ball()), []
+def test_triangles_are_left_out_until_the_page_fits(tmp_path, monkeypatch, capsys):
+    trained = set_up(tmp_path, Ball())
     options = ExportOptions("web", times="3", resolution=64)
-    whole = export(trained, options, tmp_path / "whole", say=said.append) / "index.html"
-    assert "wanted" not in said[-1]
+    whole = export(trained, options, tmp_path / "whole") / "index.html"
+    assert "reduced" not in capsys.readouterr().out
     scripts = sum(len((module.PARTS / name).read_bytes()) for name in ("page.html", "three.min.js"))
     limit = scripts + module.SPARE + (whole.stat().st_size - scripts) // 3
     monkeypatch.setattr(module, "LIMIT", limit)
-    small = export(trained, options, tmp_path / "small", say=said.append) / "index.html"
+    small = export(trained, options, tmp_path / "small") / "index.html"
     assert small.stat().st_size < limit < whole.stat().st_size
     listed = json.loads((tmp_path / "small" / "export.json").read_text())
     assert 16 < listed["resolution"] < 64
-    assert f"resolution {listed['resolution']}; " in said[-1]
+    assert f"resolution {listed['resolution']}; reduced to" in capsys.readouterr().out
     monkeypatch.setattr(module, "LIMIT", scripts + module.SPARE + 100)
     with pytest.raises(ConfigError, match="--times 3: these timesteps do not fit"):
-        export(trained, options, tmp_path / "none", say=quiet)
+        export(trained, options, tmp_path / "none")
 
 
 def test_points_are_shown_where_their_number_is_given(tmp_path):

@@ -118,16 +118,16 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, type[Hub]]]:
         yield address, handler
 
 
-def test_a_run_comes_back_from_the_hub_as_it_was_pushed(hub, trained_run, tmp_path):
+def test_a_run_comes_back_from_the_hub_as_it_was_pushed(hub, trained_run, tmp_path, capsys):
     address, held = hub
-    said: list[str] = []
-    url = push(trained_run, "somebody/excavator", say=said.append, endpoint=address)
+    url = push(trained_run, "somebody/excavator", endpoint=address)
     assert url == f"{address}/somebody/excavator"
-    assert re.match(r"uploading   \d+ files, [\d.]+ MB, to somebody/excavator", said[0])
+    said = capsys.readouterr().out
+    assert re.match(r"uploading   \d+ files, [\d.]+ MB, to somebody/excavator", said)
     assert {"README.md", "config.yaml", "metrics.json", "checkpoints/last.ckpt"} <= set(held.files)
     assert not [name for name in held.files if name.endswith((".log", ".lock"))]
 
-    options = {"say": said.append, "outputs": tmp_path / "outputs", "endpoint": address}
+    options = {"outputs": tmp_path / "outputs", "endpoint": address}
     run = fetch("hf://somebody/excavator", **options)
     assert run == tmp_path / "outputs" / "hub" / "somebody" / "excavator"
     for name, content in held.files.items():
@@ -146,12 +146,12 @@ def test_a_run_comes_back_from_the_hub_as_it_was_pushed(hub, trained_run, tmp_pa
 
     # Without a network, the copy serves.
     assert fetch("hf://somebody/excavator", **{**options, "endpoint": NOWHERE}) == run
-    assert said[-1].startswith("offline     ")
+    assert capsys.readouterr().out.splitlines()[-1].startswith("offline     ")
 
 
 def test_what_names_the_machine_stays_there(hub, trained_run):
     address, held = hub
-    push(trained_run, "somebody/excavator", say=print, endpoint=address)
+    push(trained_run, "somebody/excavator", endpoint=address)
     mine = json.loads((trained_run / "run.json").read_text())
     theirs = json.loads(held.files["run.json"])
     assert set(mine) - set(theirs) == {"directory", "process"}
@@ -209,7 +209,7 @@ def test_commands_read_a_run_of_the_hub(hub, trained_run, tmp_path, monkeypatch,
 
 def test_what_cannot_be_is_refused_in_words(hub, trained_run, tmp_path, monkeypatch):
     address, _ = hub
-    options: dict[str, Any] = {"say": print, "outputs": tmp_path}
+    options: dict[str, Any] = {"outputs": tmp_path}
     with pytest.raises(ConfigError, match="excavator: a repository on the hub is written USER/"):
         fetch("hf://excavator", **options)
     with pytest.raises(ConfigError, match=r"hf://no/body cannot be read.*hf auth login"):
@@ -217,10 +217,10 @@ def test_what_cannot_be_is_refused_in_words(hub, trained_run, tmp_path, monkeypa
     with pytest.raises(ConfigError, match=r"hf://no/body cannot be read: .*:9 cannot be reached"):
         fetch("hf://no/body", **options, endpoint=NOWHERE)
     with pytest.raises(ConfigError, match="leave out @v1"):
-        push(trained_run, "somebody/excavator@v1", say=print)
+        push(trained_run, "somebody/excavator@v1")
     (tmp_path / "run").mkdir()
     with pytest.raises(ConfigError, match=r"has no checkpoints/last\.ckpt"):
-        push(tmp_path / "run", "somebody/excavator", say=print)
+        push(tmp_path / "run", "somebody/excavator")
     monkeypatch.setenv("HF_TOKEN", "hf_wrong")
     with pytest.raises(ConfigError, match=r"cannot be written.*HF_TOKEN"):
-        push(trained_run, "somebody/excavator", say=print, endpoint=address)
+        push(trained_run, "somebody/excavator", endpoint=address)

@@ -314,7 +314,7 @@ WRONG = {
     [(True, "model.fine.texels=256 adds"), (False, "Planes with 256 texels per side would")],
 )
 def test_finer_planes_are_recommended_as_the_model_can_have_them(fine, advice):
-    (found,) = texel_findings(15, 960, 960, 64, fine=fine)
+    (found,) = texel_findings(15, 960, 64, fine=fine)
     assert f"960 pixels wide. {advice}" in found.text
 
 

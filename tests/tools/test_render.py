@@ -12,7 +12,7 @@ from xplanes.errors import ConfigError
 from xplanes.evaluation.render import write_video
 from xplanes.optional import MissingExtraError
 from xplanes.rendering.pictures import to_bytes
-from xplanes.tools.render import VideoOptions, cameras, check_out, find_view, render_video, times
+from xplanes.tools.render import VideoOptions, cameras, find_view, render_video, times
 from xplanes.tools.runs import TrainedRun, load_run
 from xplanes.training.scores import score_view
 
@@ -66,17 +66,18 @@ def test_the_camera_of_a_view_renders_that_view(trained, tmp_path):
     expected = to_bytes(score_view(*parts, views, 1, torch.ones(3))[1]["colour"]).numpy()
     own = str(float(views.times[1]))
     for name, time in (("a.png", None), ("b.png", "own"), ("c.png", own), ("d.webp", "own")):
-        path = render_video(trained, VideoOptions("view:test/r_001", time), str(tmp_path / name))
+        options = VideoOptions("view:test/r_001", time, out=str(tmp_path / name))
+        path = render_video(trained, options)
         picture = np.asarray(Image.open(path).convert("RGB")).astype(int)
         if path.suffix == ".png":
             assert np.array_equal(picture, expected), name
-    jpeg = render_video(trained, VideoOptions("view:test/r_001"), str(tmp_path / "e.jpg"))
+    jpeg = render_video(trained, VideoOptions("view:test/r_001", out=str(tmp_path / "e.jpg")))
     with Image.open(jpeg) as picture:
         assert picture.format == "JPEG"
         assert np.abs(np.asarray(picture).astype(int) - expected).mean() < 4
     # A folder or a video of several frames lets time pass.
-    assert VideoOptions("view:test/r_001").written_to("video.webp").count == 48
-    assert VideoOptions("view:test/r_001", frames=3).written_to("a.png").count == 3
+    assert VideoOptions("view:test/r_001", out="video.webp").count == 48
+    assert VideoOptions("view:test/r_001", frames=3, out="a.png").count == 3
 
 
 def test_a_webp_is_the_default(trained):
@@ -90,11 +91,11 @@ def test_a_webp_is_the_default(trained):
 
 
 def test_a_folder_takes_a_png_per_frame_and_no_others(trained, tmp_path):
-    options = VideoOptions(frames=2, size=16)
-    folder = render_video(trained, options, f"{tmp_path}/frames/")
+    options = VideoOptions(frames=2, size=16, out=f"{tmp_path}/frames/")
+    folder = render_video(trained, options)
     assert sorted(p.name for p in folder.iterdir()) == ["frame_0000.png", "frame_0001.png"]
     with pytest.raises(ConfigError, match="holds files already"):
-        render_video(trained, options, f"{tmp_path}/frames/")
+        render_video(trained, options)
 
 
 def test_an_mp4_keeps_its_frames(tmp_path):
@@ -111,13 +112,13 @@ def test_an_mp4_keeps_its_frames(tmp_path):
 def test_an_mp4_without_the_extra_names_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(MissingExtraError, match=r'-e "\.\[video\]"'):
-        check_out("video.mp4", VideoOptions())
+        VideoOptions(out="video.mp4").check()
 
 
 def test_other_files_are_refused():
     for out, words in {"video.gif": "end in .webp", "video": "end in", "a.png": "not 48"}.items():
         with pytest.raises(ConfigError, match=words):
-            check_out(out, VideoOptions())
+            VideoOptions(out=out).check()
 
 
 def test_options_out_of_range_are_refused():

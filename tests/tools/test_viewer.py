@@ -42,7 +42,7 @@ def trained(trained_run: Path) -> TrainedRun:
 
 @pytest.fixture
 def viewer(trained: TrainedRun) -> Iterator[Viewer]:
-    found = Viewer(trained.module, trained.scene, lambda: trained.module.renderer, port=18080)
+    found = Viewer(trained.module, trained.scene, port=18080)
     yield found
     found.close()
 
@@ -138,17 +138,17 @@ def test_a_full_picture_is_given_up_when_the_camera_moves(viewer, client, monkey
     monkeypatch.setattr(module, "MOVING_SECONDS", 0.0)
     viewer.catch_up()
     time.sleep(module.SETTLE_SECONDS + 0.01)
-    renderer, slow = viewer.renderer, []
+    draw, begun = module.draw, []
 
-    def moving() -> Any:
-        slow.append(1)
-        if len(slow) == 1:
+    def moving(*parts: Any, **options: Any) -> Any:
+        begun.append(1)
+        if len(begun) == 1:
             client.move()
-        return renderer()
+        return draw(*parts, **options)
 
-    monkeypatch.setattr(viewer, "renderer", moving)
+    monkeypatch.setattr(module, "draw", moving)
     viewer.catch_up()
-    assert len(slow) == 2  # The full one was begun.
+    assert len(begun) == 2  # The full one was begun.
     assert client.rows == [module.FEWEST] * 2
 
 

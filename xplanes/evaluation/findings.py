@@ -1,5 +1,6 @@
 """Possible problems of a capture, each with numbers and a remedy."""
 
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -79,7 +80,11 @@ def scene_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
     """Problems that a run warns of before it trains; arguments as for `camera_findings`."""
     yield from camera_findings(scene, frame)
     yield from opaque_findings(scene)
-    yield from stray_findings(scene)
+    views = scene.splits["train"]
+    if not views.is_opaque:
+        chosen = spread(AT_START, len(views))
+        stray = [(views.files[i], stray_pixels(views.image(i)[..., 3])) for i in chosen]
+        yield from stray_finding(stray)
 
 
 def opaque_findings(scene: Scene) -> Iterator[Finding]:
@@ -90,15 +95,6 @@ def opaque_findings(scene: Scene) -> Iterator[Finding]:
             "the images are opaque and end in the background's colour: there an empty field and a "
             "filled one look the same. Write RGBA images or masks",
         )
-
-
-def stray_findings(scene: Scene) -> Iterator[Finding]:
-    """Finds training images, among a sample, with alpha away from their silhouettes."""
-    views = scene.splits["train"]
-    if not views.is_opaque:
-        chosen = spread(AT_START, len(views))
-        stray = [(views.files[i], stray_pixels(views.image(i)[..., 3])) for i in chosen]
-        yield from stray_finding(stray)
 
 
 def time_steps(views: Views) -> Tensor:
@@ -150,9 +146,9 @@ def _times(scene: Scene, train: Views) -> Iterator[Finding]:
 
 def _same_camera_other_image(views: Views) -> tuple[int, int] | None:
     """Indices of two views with the same pose whose images differ; None if there are none."""
-    groups: dict[bytes, int] = {}
+    first: dict[bytes, int] = {}
     for index, pose in enumerate(views.camera_to_world):
-        other = groups.setdefault(pose.contiguous().numpy().tobytes(), index)
+        other = first.setdefault(pose.contiguous().numpy().tobytes(), index)
         if other == index or views.size(other) != views.size(index):
             continue
         apart = (views.image(index).short() - views.image(other).short()).abs().amax(dim=-1)
@@ -197,11 +193,12 @@ def shared_finding(
 
 def _sizes(scene: Scene) -> Iterator[Finding]:
     """Images of one camera that differ in size."""
-    sizes: dict[tuple[float, ...], dict[tuple[int, int], int]] = {}
+    sizes: dict[tuple[float, ...], Counter[tuple[int, int]]] = defaultdict(Counter)
     for views in scene.splits.values():
-        for key, size in zip(calibrations(views), views.intrinsics.size.tolist(), strict=True):
-            found = sizes.setdefault(key, {})
-            found[(size[1], size[0])] = found.get((size[1], size[0]), 0) + 1
+        for key, (height, width) in zip(
+            calibrations(views), views.intrinsics.size.tolist(), strict=True
+        ):
+            sizes[key][width, height] += 1
     mixed = [found for found in sizes.values() if len(found) > 1]
     if mixed:
         words = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in mixed[0].items())
@@ -258,8 +255,7 @@ def sees_centre(views: Views, frame: Frame) -> Tensor:
     for index in range(len(views)):
         column, row, seen = pixels_of(views, index, frame.centre[None])
         height, width = views.size(index)
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        found[index] = seen & inside
+        found[index] = seen & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     return found
 
 

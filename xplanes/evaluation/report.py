@@ -130,8 +130,9 @@ def estimated(
     final = data.scene.splits[data.test_split]
     views = data.scene.splits[data.validation_split or data.test_split]
     at = experiment.callbacks.get("evaluation", {}).get("at", [])
+    # A number of views, or a share of them.
     limit = affordable(trainer.get("limit_val_batches", 1.0), views)
-    count = scored_views(limit, len(views))
+    count = min(limit, len(views)) if isinstance(limit, int) else int(limit * len(views))
     pixels = views.height * views.width * count
     whole = done + train / expected.step  # Evaluations before a resume are not repeated.
     steps_at = [share * whole for share in {*at, 1.0} if not done or share * whole > done]
@@ -150,11 +151,6 @@ def estimated(
             '"callbacks.evaluation.at=[1]" data.eval_views=4 shorten them'
         )
     return text
-
-
-def scored_views(limit: float, views: int) -> int:
-    """Validation views per evaluation; ``trainer.limit_val_batches`` is a number or a share."""
-    return min(limit, views) if isinstance(limit, int) else int(limit * views)
 
 
 def summary(
@@ -283,58 +279,58 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
         scores += f"  of the object {test['psnr_foreground']:.2f}"
     if "floaters" in test:
         scores += f"  floaters {100 * test['floaters']:.2f}%"
-    warnings = []
+    lines = [
+        f"\n{metrics['split']:<9}{scores}  over {len(metrics['views'])} views, step "
+        f"{metrics['step']}"
+    ]
     if test["psnr"] < blank + LITTLE:
-        warnings.append(
+        lines.append(
             f"warning  hardly better than images of background alone ({blank:.2f} dB): this run "
             "shows nothing yet"
         )
     if (share := test.get("floaters", 0)) > CLUTTERED:
-        warnings.append(
+        lines.append(
             f"warning  {100 * share:.0f}% of the background is not empty (floaters): train longer, "
             "or check the cameras and times; content that\n         is too thin or too fast for "
             "the views shows up as floaters as well"
         )
     if experiment.device.type == "cpu" and (share := metrics["cpu_share"]) < BUSY:
-        warnings.append(
+        lines.append(
             f"warning  training got {share:.1f} s of CPU time a second: other programs use this "
             "machine, or a disk\n         is slow; an idle machine trains further in the same time"
         )
-    place = shlex.quote(str(run))
-    named = "".join(f" --plugin {name}" for name in experiment.config.get("plugins") or [])
-    curves = [f"tensorboard --logdir {place}"] * any(run.rglob("events.out.tfevents.*"))
-    skips = (
-        f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "
-        f"{100 * skipped['occluded']:.0f}% behind surfaces, "
-        f"{100 * skipped['background']:.0f}% of pixels as background; "
-        f"{metrics['samples_per_ray']:.1f} samples a ray remained"
-    )
-    # Without callbacks.checkpoints there is nothing to render or to resume.
-    kept = "checkpoints/last.ckpt  " if (run / "checkpoints" / LAST).is_file() else ""
-    steps = [*curves, f"xplanes render {place}{named}", resume_command(run) + more]
-    steps = steps if kept else curves
-    more_time = {
-        "reading the scene": seconds["load"],
-        "compiled loops": seconds["warm_up"],
-        "scoring": seconds["evaluate"],
-        "start, checkpoints and video": seconds["other"],
-    }
-    parts = [f"{name} {value:.1f} s" for name, value in more_time.items() if value >= 1]
-    moved = []
     if (cameras := metrics.get("cameras")) is not None:
-        moved.append(
+        lines.append(
             f"cameras  moved by {cameras['mean_px']:.2f} px on average, at most by "
             f"{cameras['most_px']:.2f} px ({cameras['farthest']}); poses in metrics.json"
         )
-    lines = [
-        f"\n{metrics['split']:<9}{scores}  over {len(metrics['views'])} views, step "
-        f"{metrics['step']}",
-        *warnings,
-        *moved,
+    stages = {
+        "reading the scene": seconds["load"],
+        "loading and compiling loops": seconds["warm_up"],
+        "scoring": seconds["evaluate"],
+        "start, checkpoints and video": seconds["other"],
+    }
+    spent = [f"{name} {value:.1f} s" for name, value in stages.items() if value >= 1]
+    lines += [
         f"time     prepare {sum(seconds['prepare'].values()):.1f} s + train "
         f"{seconds['train']:.1f} s, {metrics['rays_per_second'] / 1000:.1f}k rays/s",
-        f"         {seconds['total']:.1f} s in all; {', '.join(parts)}",
-        *([skips] if metrics["samples_per_ray"] else []),
+        f"         {seconds['total']:.1f} s in all; {', '.join(spent)}",
+    ]
+    if metrics["samples_per_ray"]:
+        lines.append(
+            f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "
+            f"{100 * skipped['occluded']:.0f}% behind surfaces, "
+            f"{100 * skipped['background']:.0f}% of pixels as background; "
+            f"{metrics['samples_per_ray']:.1f} samples a ray remained"
+        )
+    place = shlex.quote(str(run))
+    steps = [f"tensorboard --logdir {place}"] * any(run.rglob("events.out.tfevents.*"))
+    kept = ""
+    if (run / "checkpoints" / LAST).is_file():  # Else there is nothing to render or to resume.
+        kept = "checkpoints/last.ckpt  "
+        named = "".join(f" --plugin {name}" for name in experiment.config.get("plugins") or [])
+        steps += [f"xplanes render {place}{named}", resume_command(run) + more]
+    lines += [
         f"memory   {metrics['peak_memory_bytes'] / 2**30:.1f} GB at its peak",
         f"wrote    {run}",
         f"         metrics.json  curve.csv  {kept}{metrics.get('media', '')}",

@@ -82,8 +82,10 @@ def read_camera_path(path: Path) -> CameraPath:
     if fps is None and nerfstudio and is_positive(seconds):
         fps = max(1, round(len(entries) / seconds))
     height, width = ("render_height", "render_width") if nerfstudio else ("h", "w")
+    key = "camera_to_world" if nerfstudio else "transform_matrix"
+    poses = [checked_pose(label, entry.get(key), key) for label, entry in entries.items()]
     return CameraPath(
-        poses=_poses(entries, "camera_to_world" if nerfstudio else "transform_matrix"),
+        poses=torch.from_numpy(np.stack(poses)).float(),
         times=_times(path, entries, ("render_time", "time") if nerfstudio else ("time",)),
         tangents=_tangents(path, content, entries, nerfstudio=nerfstudio),
         upright=nerfstudio,
@@ -161,11 +163,6 @@ def _tangents(
             )
         tangents.append(math.tan(0.5 * math.pi * angle / most))
     return torch.tensor(tangents)
-
-
-def _poses(entries: Entries, key: str) -> Tensor:
-    poses = [checked_pose(label, entry.get(key), key) for label, entry in entries.items()]
-    return torch.from_numpy(np.stack(poses)).float()
 
 
 def _times(path: Path, entries: Entries, keys: tuple[str, ...]) -> Tensor:

@@ -77,7 +77,7 @@ def _triplanes(options: argparse.Namespace) -> None:
     from xplanes.experiment import Experiment
     from xplanes.tools.turntable import write_triplanes
 
-    write_triplanes(paths, Path(out), Experiment.read(plain), say=say)
+    write_triplanes(paths, Path(out), Experiment.read(plain))
 
 
 def _load(options: argparse.Namespace, split: str | None = None) -> "TrainedRun":
@@ -86,7 +86,7 @@ def _load(options: argparse.Namespace, split: str | None = None) -> "TrainedRun"
     from xplanes.tools.runs import find_run, load_run
 
     on_hub = options.run.startswith(SCHEME)
-    run = fetch(options.run, say=say) if on_hub else find_run(Path(options.run))
+    run = fetch(options.run) if on_hub else find_run(Path(options.run))
     given = {"checkpoint": options.checkpoint, "plugins": options.plugin, "announce": say}
     return load_run(run, split=split, **given)
 
@@ -108,17 +108,16 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
-    from xplanes.tools.render import VideoOptions, check_out, render_video
+    from xplanes.tools.render import VideoOptions, render_video
 
-    wanted = _filled(VideoOptions, options).written_to(options.out)
+    wanted = _filled(VideoOptions, options)
     wanted.check()
-    check_out(options.out, wanted)
     trained = _load(options)
     height, width = wanted.shape(trained.scene.splits)
     written = "as in the file" if wanted.cameras is not None else "back-and-forth"
     camera = f"{options.path} camera, time {wanted.time or written}"
     say(f"frames      {wanted.count} of {width}x{height} px, {options.what}, {camera}\n")
-    say(f"wrote {render_video(trained, wanted, options.out)}")
+    say(f"wrote {render_video(trained, wanted)}")
 
 
 def _view(options: argparse.Namespace) -> None:
@@ -126,10 +125,7 @@ def _view(options: argparse.Namespace) -> None:
 
     check_address(options.host, options.port, key="--{} ")
     trained = _load(options)
-    module = trained.module
-    viewer = Viewer(
-        module, trained.scene, lambda: module.renderer, host=options.host, port=options.port
-    )
+    viewer = Viewer(trained.module, trained.scene, host=options.host, port=options.port)
     viewer.tell(f"**{trained.path.name}**  \nstep {trained.step}, {trained.checkpoint}.ckpt")
     port = viewer.port
     say(f"\nopen        http://localhost:{port}")
@@ -151,7 +147,7 @@ def _export(options: argparse.Namespace) -> None:
     wanted.check()
     if options.out is not None:
         require_empty(options.out)
-    say(f"wrote {export(_load(options), wanted, options.out, say=say)}")
+    say(f"wrote {export(_load(options), wanted, options.out)}")
 
 
 def _push(options: argparse.Namespace) -> None:
@@ -159,7 +155,7 @@ def _push(options: argparse.Namespace) -> None:
     from xplanes.tools.runs import find_run
 
     run = find_run(options.run)
-    say(f"wrote {push(run, options.repository, private=options.private, say=say)}")
+    say(f"wrote {push(run, options.repository, private=options.private)}")
 
 
 def _table(options: argparse.Namespace) -> None:

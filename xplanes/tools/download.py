@@ -5,20 +5,23 @@ import shutil
 import time
 import zipfile
 import zlib
-from collections.abc import Callable
 from http.client import HTTPException, HTTPResponse
 from pathlib import Path, PurePosixPath
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
 from xplanes.errors import SceneError
-from xplanes.files import storage_error
+from xplanes.files import storage_errors
+from xplanes.process import say
 
 CHUNK_BYTES = 1 << 20
 TIMEOUT_SECONDS = 30
 ATTEMPTS = 5
 PAUSE_SECONDS = 2.0
 PROGRESS_SECONDS = 5.0
+SPACE = 2.1
+"""Free space needed for the archive, in multiples of its size: its images hardly compress, so
+unpacking takes the same space again."""
 
 
 class FetchError(Exception):
@@ -29,9 +32,7 @@ class _BrokenTransferError(Exception):
     """The transfer was interrupted; another attempt may succeed."""
 
 
-def fetch(
-    url: str, path: Path, *, announce: Callable[[str], None] = print, space_factor: float = 1.0
-) -> None:
+def fetch(url: str, path: Path) -> None:
     """Download ``url`` to ``path``; an incomplete download is kept in ``path``.part.
 
     Another call resumes an interrupted download, if the server still has the same file (compared by
@@ -40,8 +41,6 @@ def fetch(
     Args:
         url: Address, http or https.
         path: The file, which is written atomically.
-        announce: Receives progress messages.
-        space_factor: Required free disk space, in multiples of the file's size.
 
     Raises:
         FetchError: The server cannot be reached or refuses, or the disk is too full.
@@ -51,13 +50,13 @@ def fetch(
     part = path.with_name(f"{path.name}.part")
     for attempt in range(ATTEMPTS):
         try:
-            _advance(url, part, announce, space_factor)
+            _advance(url, part)
         except _BrokenTransferError as problem:
             unreachable = attempt == 0 and isinstance(problem.__cause__, URLError)
             if unreachable or attempt == ATTEMPTS - 1:
                 kept = f" {_size(part)} MB are kept in {part}." if part.exists() else ""
                 raise FetchError(f"{problem}.{kept}") from problem
-            announce(f"{problem}; trying again")
+            say(f"{problem}; trying again")
             time.sleep(PAUSE_SECONDS)
         else:
             part.replace(path)
@@ -65,7 +64,7 @@ def fetch(
             return
 
 
-def _advance(url: str, part: Path, announce: Callable[[str], None], space_factor: float) -> None:
+def _advance(url: str, part: Path) -> None:
     """Download the rest of ``part``, or all of it if it cannot be resumed."""
     validator = _saved_validator(url, part)
     start = part.stat().st_size if validator else 0
@@ -90,28 +89,23 @@ def _advance(url: str, part: Path, announce: Callable[[str], None], space_factor
             if not begins or _validator(response) not in (None, validator):
                 _discard(part)
                 raise _BrokenTransferError(f"{url} has changed since the download began")
-            announce(f"Continuing {url} after {_size(part)} MB")
+            say(f"Continuing {url} after {_size(part)} MB")
         else:
             if response.headers.get_content_type() == "text/html":  # ``part`` is kept.
                 raise FetchError(f"{url} answered with a web page instead of a file.")
             start = 0
-            _save_validator(url, part, response)
-        _receive(url, response, part, start, announce, space_factor)
+            # Delete the old part first, so that it is never paired with the new identifier.
+            _discard(part)
+            note = {"url": url, "validator": _validator(response)}
+            _note_path(part).write_text(json.dumps(note), encoding="utf-8")
+        _receive(url, response, part, start)
 
 
-def _receive(
-    url: str,
-    response: HTTPResponse,
-    part: Path,
-    start: int,
-    announce: Callable[[str], None],
-    space_factor: float,
-) -> None:
+def _receive(url: str, response: HTTPResponse, part: Path, start: int) -> None:
     total = None if response.length is None else start + response.length
     if total is not None:
-        check_space(part.parent, int(space_factor * total) - start)
-    received = start
-    reported = time.monotonic()
+        check_space(part.parent, int(SPACE * total) - start)
+    received, reported = start, time.monotonic()
     with part.open("ab" if start else "wb") as file:
         while True:
             try:
@@ -127,7 +121,7 @@ def _receive(
             if time.monotonic() - reported > PROGRESS_SECONDS:
                 reported = time.monotonic()
                 of_total = f" of {total / 1e6:.0f}" if total else ""
-                announce(f"{received / 1e6:.0f}{of_total} MB")
+                say(f"{received / 1e6:.0f}{of_total} MB")
     # Python returns an empty chunk if the connection ends early.
     if total is not None and received < total:
         raise _BrokenTransferError(
@@ -168,13 +162,6 @@ def _saved_validator(url: str, part: Path) -> str | None:
         return None
 
 
-def _save_validator(url: str, part: Path, response: HTTPResponse) -> None:
-    # Delete the old part first, so that it is never paired with the new identifier.
-    _discard(part)
-    note = {"url": url, "validator": _validator(response)}
-    _note_path(part).write_text(json.dumps(note), encoding="utf-8")
-
-
 def _discard(part: Path) -> None:
     part.unlink(missing_ok=True)
     _note_path(part).unlink(missing_ok=True)
@@ -208,12 +195,7 @@ TEST_VIEWS = 20
 SPLITS = ("train", "val", "test")
 
 
-def download_dnerf(
-    root: Path,
-    *,
-    url: str = DNERF_URL,
-    announce: Callable[[str], None] = print,
-) -> Path:
+def download_dnerf(root: Path, *, url: str = DNERF_URL) -> Path:
     """Download the eight D-NeRF scenes into ``root``; incomplete scenes are never left there.
 
     The next call resumes an interrupted download. Existing scenes are not changed. An archive that
@@ -222,7 +204,6 @@ def download_dnerf(
     Args:
         root: Folder for one folder per scene; created if missing.
         url: Address of the archive.
-        announce: Receives progress messages.
 
     Returns:
         The folder of the scenes, which is the value for data.root.
@@ -232,19 +213,16 @@ def download_dnerf(
         StorageError: The disk is full, or cannot be written.
     """
     root = Path(root).absolute()
-    try:
-        return _downloaded(root, url, announce)
-    except OSError as problem:
-        if (words := storage_error(problem, root)) is None:
-            raise
-        raise words from problem
+    with storage_errors(root):
+        _download_missing(root, url)
+    return root
 
 
-def _downloaded(root: Path, url: str, announce: Callable[[str], None]) -> Path:
+def _download_missing(root: Path, url: str) -> None:
     missing = [name for name in TRAIN_VIEWS if not (root / name / "transforms_train.json").exists()]
     if not missing:
-        announce(f"All D-NeRF scenes are already in {root}")
-        return root
+        say(f"All D-NeRF scenes are already in {root}")
+        return
     for name in missing:
         if (root / name).exists():
             raise SceneError(
@@ -256,12 +234,11 @@ def _downloaded(root: Path, url: str, announce: Callable[[str], None]) -> Path:
     by_hand = archive.exists()
     try:
         if by_hand:
-            announce(f"Using {archive}, which is already there")
+            say(f"Using {archive}, which is already there")
         else:
-            announce(f"Downloading {url} to {archive}")
-            # Images hardly compress, so unpacking takes the same space again.
-            fetch(url, archive, announce=announce, space_factor=2.1)
-        _install(archive, root, missing, announce)
+            say(f"Downloading {url} to {archive}")
+            fetch(url, archive)
+        _install(archive, root, missing)
     except FetchError as problem:
         raise SceneError(
             f"{problem} Try again later to continue; or fetch {DNERF_URL} by hand, save it as "
@@ -276,22 +253,21 @@ def _downloaded(root: Path, url: str, announce: Callable[[str], None]) -> Path:
         ) from problem
     if not by_hand:
         archive.unlink()
-    announce(f"Scenes in {root}: {', '.join(sorted(TRAIN_VIEWS))}")
-    return root
+    say(f"Scenes in {root}: {', '.join(sorted(TRAIN_VIEWS))}")
 
 
 class _BadArchiveError(Exception):
     """The archive is damaged or not the expected one."""
 
 
-def _install(archive: Path, root: Path, names: list[str], announce: Callable[[str], None]) -> None:
+def _install(archive: Path, root: Path, names: list[str]) -> None:
     """Unpack into a temporary folder, check all scenes, and only then move them into place."""
     workspace = root / ".dnerf-unpacking"
     shutil.rmtree(workspace, ignore_errors=True)
     try:
         _unpack(archive, workspace, names)
         for name in names:
-            _check_scene(workspace / name, announce)
+            _check_scene(workspace / name)
         for name in names:
             (workspace / name).rename(root / name)
     finally:
@@ -299,22 +275,16 @@ def _install(archive: Path, root: Path, names: list[str], announce: Callable[[st
 
 
 def _unpack(archive: Path, workspace: Path, names: list[str]) -> None:
+    wanted = []
     try:
         with zipfile.ZipFile(archive) as source:
-            files = [member for member in source.infolist() if not member.is_dir()]
-            targets = [_target(member.filename) for member in files]
-            wanted = [
-                (member, target)
-                for member, target in zip(files, targets, strict=True)
-                if target is not None and target.parts[0] in names
-            ]
-            check_space(archive.parent, sum(member.file_size for member, _ in wanted))
-            for member, target in wanted:
-                path = workspace / target
-                path.parent.mkdir(parents=True, exist_ok=True)
-                # Reading to the end verifies the member's CRC.
-                with source.open(member) as packed, path.open("wb") as file:
-                    shutil.copyfileobj(packed, file, 1 << 20)
+            for member in source.infolist():
+                target = None if member.is_dir() else _target(member.filename)
+                if target is not None and target.parts[0] in names:
+                    member.filename = str(target)
+                    wanted.append(member)
+            check_space(archive.parent, sum(member.file_size for member in wanted))
+            source.extractall(workspace, wanted)  # Verifies CRCs.
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as problem:
         raise _BadArchiveError(f"it is damaged or no zip file ({problem})") from problem
 
@@ -328,7 +298,7 @@ def _target(member: str) -> PurePosixPath | None:
     return PurePosixPath(*parts) if len(parts) > 1 and parts[0] in TRAIN_VIEWS else None
 
 
-def _check_scene(folder: Path, announce: Callable[[str], None]) -> None:
+def _check_scene(folder: Path) -> None:
     """Compare an unpacked scene with the known contents of the data set."""
     name = folder.name
     for split in SPLITS:
@@ -348,4 +318,4 @@ def _check_scene(folder: Path, announce: Callable[[str], None]) -> None:
             )
         # The number of test views is not certain, so a difference is no error.
         if split == "test" and len(files) != TEST_VIEWS:
-            announce(f"Note: {name} has {len(files)} test views; {TEST_VIEWS} are usual")
+            say(f"Note: {name} has {len(files)} test views; {TEST_VIEWS} are usual")

@@ -23,6 +23,9 @@ MODES = ("colour", "depth", "opacity", "floaters")
 NEAREST = 4
 """Number of training images, nearest in time, whose silhouettes identify floaters."""
 
+MOST_CAMERAS = 100
+"""Most training cameras that are drawn."""
+
 SLACK = 0.02
 """Margin around silhouettes, in the field's frame, within which nothing counts as a floater."""
 
@@ -61,10 +64,6 @@ class Shot:
         """The camera, in the field's frame."""
         focal = 0.5 * self.height / math.tan(0.5 * self.fov)
         return PosedCamera(self.pose, focal, self.height, self.width)
-
-    def rays(self) -> tuple[Tensor, Tensor]:
-        """Rays through all pixels, row by row. [H W, 3], [H W, 3]"""
-        return self.camera.rays()
 
 
 @dataclass(frozen=True)
@@ -119,7 +118,7 @@ def draw(
     outside = None
     if shot.mode == "floaters":
         outside = shown.masked(ruled_out(views, frame, shot.time))
-    origins, directions = shot.rays()
+    origins, directions = shot.camera.rays()
     moved = shift(renderer, shot.pose[:3, 3], views, frame)
     at_once = at_once if isinstance(renderer, RayRenderer) else len(origins)
     parts: list[Tensor] = []
@@ -246,7 +245,3 @@ def camera_outlines(views: Views, frame: Frame, length: float) -> tuple[Tensor, 
         lines += [around, corners]
         times.append(views.times[index].expand(len(around) + len(corners)))
     return torch.cat(lines), torch.cat(times)
-
-
-MOST_CAMERAS = 100
-"""Most training cameras that are drawn."""

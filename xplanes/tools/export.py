@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from xplanes.fields.base import SurfaceField, ViewDependentField
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES, XPlanes
 from xplanes.files import replacing, require_empty, require_writable, write_json
 from xplanes.optional import require
+from xplanes.process import say
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.box import ray_box
 from xplanes.rendering.grid_renderer import GridRenderer
@@ -140,20 +140,13 @@ def export_times(text: str) -> list[float]:
     return times
 
 
-def export(
-    trained: TrainedRun,
-    options: ExportOptions,
-    out: Path | None = None,
-    *,
-    say: Callable[[str], None],
-) -> Path:
+def export(trained: TrainedRun, options: ExportOptions, out: Path | None = None) -> Path:
     """Export a run for other programs, and list the files in ``export.json``.
 
     Args:
         trained: The run.
         options: Content and format of the export.
         out: Folder to write into, empty or new; ``export/WHAT`` in the run directory when None.
-        say: Receives progress messages.
 
     Returns:
         The folder.
@@ -180,18 +173,14 @@ def export(
             facts["left_out"] = "the background outside of the field's cube"
             say(f"left out    {facts['left_out']}; --what planes exports it")
         several = WEB_TIMES if options.what == "web" else TIMES
-        times = export_times(options.times or str(1 if trained.is_static else several))
-        facts |= {"times": times} | _write_times(folder, trained, options, times, say)
+        times = export_times(options.times or str(several if field.moves else 1))
+        facts |= {"times": times} | _write_times(folder, trained, options, times)
     write_json(folder / "export.json", facts)
     return folder
 
 
 def _write_times(
-    folder: Path,
-    trained: TrainedRun,
-    options: ExportOptions,
-    times: list[float],
-    say: Callable[[str], None],
+    folder: Path, trained: TrainedRun, options: ExportOptions, times: list[float]
 ) -> dict[str, Any]:
     """Write the files that depend on time; return their entries of ``export.json``."""
     paths = [folder / f"{options.what}_{number:04d}" for number in range(len(times))]
@@ -202,12 +191,14 @@ def _write_times(
     if threshold is not None:
         say(f"threshold   density {threshold:.4g}")
     if options.what == "web":
-        return _write_web(folder, trained, options, threshold, times, say)
+        return _write_web(folder, trained, options, threshold, times)
     files = [path.with_suffix(f".{options.form}") for path in paths]
-    written = _write_each(trained, options, threshold, times, files)
+    count = None if options.what == "mesh" else options.count or POINTS
+    shown = tqdm(times, "times", leave=False, delay=2, disable=None)
     try:
-        for _ in tqdm(written, "times", len(times), leave=False, delay=2, disable=None):
-            pass
+        for time, path in zip(shown, files, strict=True):
+            shape = shape_at(trained, time, options.resolution, threshold, count)
+            _write_shape(path, shape)
     except ConfigError:
         for path in files:  # Another threshold can then be tried with the same folder.
             path.unlink(missing_ok=True)
@@ -217,12 +208,7 @@ def _write_times(
 
 
 def _threshold(trained: TrainedRun, options: ExportOptions, times: list[float]) -> float | None:
-    """Density of the surface; None if the field defines a surface or points itself.
-
-    Raises:
-        ConfigError: If the field has none of these, or a threshold is given but not used.
-        MissingExtraError: For a surface without the extra ``export``.
-    """
+    """Density of the surface; None if the field defines a surface or points itself."""
     field, threshold = trained.module.field, options.threshold
     if options.what == "web" and field.cloud(times[0]) is not None:
         own = "points of its own"
@@ -273,29 +259,18 @@ def shape_at(
     return Shape(trained.frame.to_world(points), colours, mesh.faces if count is None else None)
 
 
-def _write_each(
-    trained: TrainedRun,
-    options: ExportOptions,
-    threshold: float | None,
-    times: Iterable[float],
-    files: Iterable[Path],
-) -> Iterable[Path]:
+def _write_shape(path: Path, shape: Shape) -> None:
+    """Write a mesh or a point cloud as PLY or GLB."""
     _, trimesh = _mesh_tools()
-    count = None if options.what == "mesh" else POINTS if options.count is None else options.count
-    for time, path in zip(times, files, strict=True):
-        shape = shape_at(trained, time, options.resolution, threshold, count)
-        # The GLB standard prescribes linear colours; PLY files use sRGB.
-        colours = _linear(shape.colours) if options.form == "glb" else shape.colours
-        pixels = (255 * colours).round().byte().numpy()
-        world = shape.places.numpy()
-        if shape.faces is None:
-            found = trimesh.PointCloud(world, colors=pixels)
-        else:
-            found = trimesh.Trimesh(world, shape.faces, vertex_colors=pixels, process=False)
-        content = _glb(found) if options.form == "glb" else found.export(file_type="ply")
-        with replacing(path) as temporary:
-            temporary.write_bytes(content)
-        yield path
+    linear = path.suffix == ".glb"  # The GLB standard prescribes linear colours, PLY has sRGB.
+    pixels = (255 * (_linear(shape.colours) if linear else shape.colours)).round().byte().numpy()
+    world = shape.places.numpy()
+    if shape.faces is None:
+        found = trimesh.PointCloud(world, colors=pixels)
+    else:
+        found = trimesh.Trimesh(world, shape.faces, vertex_colors=pixels, process=False)
+    with replacing(path) as temporary:
+        temporary.write_bytes(_glb(found) if linear else found.export(file_type="ply"))
 
 
 def _write_web(
@@ -304,7 +279,6 @@ def _write_web(
     options: ExportOptions,
     threshold: float | None,
     times: list[float],
-    say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Write the web page with all timesteps; return its entries of ``export.json``."""
     field = trained.module.field
@@ -318,10 +292,10 @@ def _write_web(
             points, colours = cloud
             kept = int(share * min(len(points), options.count or len(points)))
             return Shape(trained.frame.to_world(points[:kept].cpu()), colours[:kept].cpu())
-        if options.count is not None:
-            count = max(1, int(share * options.count))
-            return shape_at(trained, time, options.resolution, threshold, count)
-        return shape_at(trained, time, coarser(share), threshold, None)
+        if options.count is None:
+            return shape_at(trained, time, coarser(share), threshold, None)
+        count = max(1, int(share * options.count))
+        return shape_at(trained, time, options.resolution, threshold, count)
 
     written = write_page(
         folder / PAGE,
@@ -577,7 +551,7 @@ def write_planes(folder: Path, trained: TrainedRun) -> list[str]:
             "X-Planes; mesh and points work with every radiance field"
         )
     tensors = {f"planes.{name}": plane for name, plane in field.planes.items()}
-    tensors |= {f"decoder.{name}": value for name, value in field.decoder.state_dict().items()}
+    tensors |= field.decoder.state_dict(prefix="decoder.")
     if isinstance(renderer, GridRenderer):
         grid = renderer.grid
         tensors["occupied"] = grid.occupied.view(grid.time_bins, *[grid.resolution] * 3)
@@ -586,8 +560,7 @@ def write_planes(folder: Path, trained: TrainedRun) -> list[str]:
         behind = {"decoder": background.decoder.options, "samples": background.samples}
         for name, plane in zip(SPACE_PLANES, background.planes, strict=True):
             tensors[f"background.planes.{name}"] = plane.permute(2, 0, 1)
-        for name, value in background.decoder.state_dict().items():
-            tensors[f"background.decoder.{name}"] = value
+        tensors |= background.decoder.state_dict(prefix="background.decoder.")
     names = TIME_PLANES[field.plane_set]
     pairs = [[names[plane] for plane in pair] for pair in PLANE_SETS[field.plane_set]]
     content = {

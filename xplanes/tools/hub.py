@@ -3,7 +3,6 @@
 import json
 import re
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from xplanes import __version__
 from xplanes.errors import ConfigError
 from xplanes.files import read_json
 from xplanes.lrm.weights import answers
+from xplanes.process import say
 from xplanes.tools.runs import OUTPUTS, is_run
 from xplanes.training.record import read_config
 
@@ -34,7 +34,6 @@ def push(
     repository: str,
     *,
     private: bool = False,
-    say: Callable[[str], None],
     endpoint: str | None = None,
 ) -> str:
     """Upload a run with a model card.
@@ -43,7 +42,6 @@ def push(
         run: The run directory.
         repository: USER/REPOSITORY; created if it does not exist.
         private: Whether a new repository is private.
-        say: Receives progress messages.
         endpoint: Address of the hub; the default when None.
 
     Returns:
@@ -53,6 +51,7 @@ def push(
         ConfigError: If the run has no checkpoint or no metrics, or the hub refuses.
     """
     from huggingface_hub import CommitOperationAdd, HfApi, constants
+    from huggingface_hub.utils import filter_repo_objects
 
     repository, revision = _parsed(repository)
     if revision is not None:
@@ -62,12 +61,9 @@ def push(
     for needed in ("checkpoints/last.ckpt", "metrics.json", "run.json"):
         if not (run / needed).is_file():
             raise ConfigError(f"{run} has no {needed}: push a run that has finished")
-    contents: dict[str, Path | bytes] = {
-        path.relative_to(run).as_posix(): path
-        for pattern in PATTERNS
-        for path in sorted(run.glob(pattern.replace("media/*", "media/**/*")))
-        if path.is_file()
-    }
+    files = [path.relative_to(run).as_posix() for path in run.rglob("*") if path.is_file()]
+    wanted = filter_repo_objects(sorted(files), allow_patterns=list(PATTERNS))
+    contents: dict[str, Path | bytes] = {name: run / name for name in wanted}
     record = read_json(run / "run.json")
     record = {name: value for name, value in record.items() if name not in PRIVATE}
     contents["run.json"] = json.dumps(record, indent=2).encode()
@@ -93,18 +89,11 @@ def push(
     return f"{api.endpoint}/{repository}"
 
 
-def fetch(
-    address: str,
-    *,
-    say: Callable[[str], None],
-    outputs: Path = OUTPUTS,
-    endpoint: str | None = None,
-) -> Path:
+def fetch(address: str, *, outputs: Path = OUTPUTS, endpoint: str | None = None) -> Path:
     """Download a run, or the files that have changed since its last download.
 
     Args:
         address: hf://USER/REPOSITORY, optionally with @REVISION.
-        say: Receives a message before a download.
         outputs: Folder of runs; the run is saved in its subfolder hub/USER/REPOSITORY.
         endpoint: Address of the hub; the default when None.
 

@@ -154,18 +154,16 @@ def image_findings(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iter
 
 
 def texel_findings(
-    per_texel: float, native: int, wide: int, resolution: int, *, fine: bool
+    per_texel: float, wide: int, resolution: int, *, fine: bool
 ) -> Iterator[Finding]:
     """Warn if the images have far more detail than the planes can represent.
 
     Args:
-        per_texel: Image pixels per texel of the planes, see `pixels_across`.
-        native: Width of these images.
-        wide: Width of the images in training.
+        per_texel: Pixels of the images in training per texel of the planes.
+        wide: Width of these images.
         resolution: Texels along an axis of the planes.
         fine: Whether the model can have additional finer planes (``model.fine``).
     """
-    per_texel *= wide / native
     if per_texel > COARSE:
         width = max(1, round(wide * 0.5 * COARSE / per_texel))
         finer = 2 ** round(math.log2(resolution * per_texel / (0.5 * COARSE)))

@@ -3,7 +3,7 @@
 import functools
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -125,17 +125,11 @@ def choose(arguments: Sequence[str]) -> Choice:
             usual_width = compose_plain("train", [*place, *changed])["data"]["resolution"]
             place.append(NATIVE)
         changed = [*place, *changed]
-    return Choice(tuple(changed), *_settings(changed), usual_width)
-
-
-def _settings(overrides: Sequence[str]) -> tuple[SceneSettings, ModelSettings]:
-    """The settings of the scene and of the model."""
-    plain = compose_plain("train", overrides)
+    plain = compose_plain("train", changed)
     with plugins(plain.get("plugins") or []):
-        return (
-            build(plain["data"], SceneSettings, "data"),
-            build(plain["model"], ModelSettings, "model"),
-        )
+        scene = build(plain["data"], SceneSettings, "data")
+        model = build(plain["model"], ModelSettings, "model")
+    return Choice(tuple(changed), scene, model, usual_width)
 
 
 def _place(folder: Path) -> list[str]:
@@ -210,8 +204,9 @@ def inspect(choice: Choice) -> Capture:
         texels = model.texels(pixels_of_detail(train, frame, scene.is_surrounded))
         if texels is not None:
             width = _width_of_training(choice, scene) or train.width
+            per_texel = pixels / texels * width / train.width
             fine = getattr(model, "fine", None) is not None
-            findings += texel_findings(pixels / texels, train.width, width, texels, fine=fine)
+            findings += texel_findings(per_texel, width, texels, fine=fine)
     follows = {kind for each in findings for kind in CONSEQUENCES.get(each.kind, ())}
     findings = [each for each in findings if each.kind not in follows]
     return Capture(choice, scene, frame, problem, images, tuple(findings), texels)
@@ -222,20 +217,22 @@ def cameras_of(views: Views) -> list[CameraGroup]:
 
     Cameras count as fixed if each pose has two views or more on average.
     """
-    poses: dict[Any, list[int]] = {}
-    for index, pose in enumerate(views.camera_to_world):
-        poses.setdefault(pose.contiguous().numpy().tobytes(), []).append(index)
-    fixed = len(views) > 1 and 2 * len(poses) <= len(views)
-    groups = poses
+    found = _grouped(pose.contiguous().numpy().tobytes() for pose in views.camera_to_world)
+    fixed = len(views) > 1 and 2 * len(found) <= len(views)
     if not fixed:
-        groups = {}
-        for index, key in enumerate(calibrations(views)):
-            groups.setdefault(key, []).append(index)
-    found = list(groups.values())
+        found = _grouped(calibrations(views))
     folders = [{Path(views.files[i]).parent.name for i in indices} for indices in found]
     told = all(len(names) == 1 for names in folders) and len(set.union(*folders)) == len(found)
     names = [min(names) if told else f"camera {n}" for n, names in enumerate(folders)]
     return [CameraGroup(name, indices, fixed) for name, indices in zip(names, found, strict=True)]
+
+
+def _grouped(keys: Iterable[Hashable]) -> list[list[int]]:
+    """Indices of equal keys, together."""
+    groups: dict[Hashable, list[int]] = {}
+    for index, key in enumerate(keys):
+        groups.setdefault(key, []).append(index)
+    return list(groups.values())
 
 
 def lens_words(views: Views) -> str:
@@ -261,9 +258,10 @@ def distortion(views: Views) -> float:
     Fisheye lenses are compared with an equidistant one, others with a pinhole. Corners without a
     ray are ignored.
     """
-    intrinsics, largest = views.intrinsics, 0.0
+    intrinsics = views.intrinsics
     if intrinsics.lenses is None:
-        return largest
+        return 0.0
+    lengths = [torch.zeros(1)]
     different = {(*key, *views.size(index)): index for index, key in enumerate(calibrations(views))}
     for index in different.values():
         height, width = views.size(index)
@@ -278,10 +276,8 @@ def distortion(views: Views) -> float:
             straight = Lenses.pinholes(1)
         ideal_x, ideal_y, seen = straight.image_points(local)
         moved = torch.stack([x - ideal_x, y - ideal_y], dim=1) * intrinsics.focal[index]
-        moved = moved.norm(dim=1)[found & seen]
-        if len(moved):
-            largest = max(largest, float(moved.max()))
-    return largest
+        lengths.append(moved.norm(dim=1)[found & seen])
+    return float(torch.cat(lengths).max())
 
 
 def field_of_view(views: Views) -> tuple[float, float]:
@@ -319,8 +315,10 @@ def facts(capture: Capture) -> dict[str, Any]:
     }
     if frame is not None:
         away = (train.camera_to_world[:, :3, 3] - frame.centre).norm(dim=-1)
+        # Rounded to about a millionth of the cube's size, so that noise becomes 0.
+        centre = [round(x * frame.scale, 6) / frame.scale + 0.0 for x in frame.centre.tolist()]
         content["cube"] = {
-            "centre": [_rounded(float(value), frame) for value in frame.centre],
+            "centre": centre,
             "side": 2 / frame.scale,
             "source": frame.source,
             "camera_distance": [float(away.min()), float(away.median()), float(away.max())],
@@ -328,11 +326,6 @@ def facts(capture: Capture) -> dict[str, Any]:
         if capture.texels is not None:
             content["pixels_per_texel"] = pixels_across(train, frame) / capture.texels
     return content
-
-
-def _rounded(value: float, frame: Frame) -> float:
-    """A coordinate, rounded to about a millionth of the cube's size, so that noise becomes 0."""
-    return round(value * frame.scale, 6) / frame.scale + 0.0
 
 
 def _split_facts(views: Views, images: Sequence[ImageFacts]) -> dict[str, Any]:

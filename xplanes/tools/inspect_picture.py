@@ -61,7 +61,6 @@ class _Sheet:
     """A supersampled canvas, with coordinates in pixels of the final picture."""
 
     def __init__(self, width: int, height: int) -> None:
-        self.size = (width, height)
         self.image = Image.new("RGB", (SCALE * width, SCALE * height), PAPER)
         self.pen = ImageDraw.Draw(self.image)
 
@@ -72,8 +71,8 @@ class _Sheet:
         places = [(SCALE * x, SCALE * y) for x, y in points]
         self.pen.line(places, fill=colour, width=max(1, round(SCALE * width)), joint="curve")
 
-    def box(self, box: Box, fill: str | None = None, outline: str | None = None) -> None:
-        self.pen.rectangle([SCALE * value for value in box], fill=fill, outline=outline)
+    def box(self, box: Box, fill: str) -> None:
+        self.pen.rectangle([SCALE * value for value in box], fill=fill)
 
     def dot(self, place: tuple[float, float], radius: float, colour: str) -> None:
         x, y = place
@@ -113,14 +112,13 @@ def _legend(sheet: _Sheet, capture: Capture) -> None:
         (_colour(split), f"{split}, {len(views)} views")
         for split, views in capture.scene.splits.items()
     ]
-    frame = capture.frame
-    if frame is not None:
+    if (frame := capture.frame) is None:
+        entries.append((ASTRAY, "no cube: the cameras see no common volume"))
+    else:
         entries.append((CUBE, f"the field's cube, {2 / frame.scale:.3g} wide"))
         splits = capture.scene.splits.values()
         if blind := sum(int((~sees_centre(views, frame)).sum()) for views in splits):
             entries.append((ASTRAY, f"{blind} do not see the centre of the cube"))
-    else:
-        entries.append((ASTRAY, "no cube: the cameras see no common volume"))
     if (points := capture.scene.points) is not None:
         entries.append((POINT, f"{len(points)} points"))
     warned = ", ".join(dict.fromkeys(each.kind for each in capture.findings))
@@ -167,8 +165,7 @@ def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
             if all(0 < value < side for value in place):
                 sheet.dot(place, 0.8, POINT)
     train = splits["train"]
-    count = min(MOST_RAYS, len(train))
-    for index in [round((i + 0.5) * len(train) / count - 0.5) for i in range(count)]:
+    for index in _middles(MOST_RAYS, len(train)):
         reach = 0.5 * plan.span
         if frame is not None:
             place = train.camera_to_world[index, :3, 3]
@@ -307,19 +304,20 @@ def _chosen(capture: Capture) -> list[tuple[str, int]]:
     others = [(split, len(views) // 2) for split, views in splits.items() if split != "train"]
     train = splits["train"]
     by_time = train.times.argsort(stable=True).tolist()
-    count = min(len(train), SAMPLES - len(others))
-    ranks = [round((i + 0.5) * len(train) / count - 0.5) for i in range(count)]
+    ranks = _middles(SAMPLES - len(others), len(train))
     return [*(("train", by_time[rank]) for rank in ranks), *others]
+
+
+def _middles(count: int, total: int) -> list[int]:
+    """Indices of the middles of at most ``count`` equal parts of a sequence."""
+    count = min(count, total)
+    return [round((i + 0.5) * total / count - 0.5) for i in range(count)]
 
 
 def _sample(views: Views, index: int, size: tuple[int, int], frame: Frame | None) -> Image.Image:
     """An image on a chequerboard, with the edges of the cube projected by its lens.
 
-    Args:
-        views: The views.
-        index: Index of the view.
-        size: Width and height in pixels of the finished picture.
-        frame: The field's frame.
+    ``size`` is its width and height in pixels of the finished picture.
     """
     height, width = views.size(index)
     wide, high = SCALE * size[0], SCALE * size[1]

@@ -66,14 +66,7 @@ class LiveViewer(Callback):
             return
         assert isinstance(pl_module, RadianceModule)
         data: Any = trainer.datamodule  # type: ignore[attr-defined]
-        self.viewer = Viewer(
-            pl_module,
-            data.scene,
-            lambda: pl_module.renderer,
-            host=self.host,
-            port=self.port,
-            trains=True,
-        )
+        self.viewer = Viewer(pl_module, data.scene, host=self.host, port=self.port, trains=True)
         self._drawn = time.monotonic()
         print(f"viewer      http://localhost:{self.viewer.port}", flush=True)
 

@@ -2,7 +2,6 @@
 
 import difflib
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,10 +26,9 @@ from xplanes.evaluation.render import (
 from xplanes.files import require_writable
 from xplanes.scenes.cameras import PosedCamera
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import Scene, Views
+from xplanes.scenes.views import Views
 from xplanes.tools.camera_path import CameraPath, read_camera_path
 from xplanes.tools.runs import TrainedRun
-from xplanes.training.module import RadianceModule
 
 OWN = "own"
 """Value of ``--time`` for the time of the view that ``--path`` names."""
@@ -47,7 +45,8 @@ class VideoOptions:
         path: Camera: ``orbit``, ``fixed`` (the first camera of the orbit), ``view:FILE``, or a
             camera path, FILE.json.
         time: ``sweep`` (from 0 to 1), ``back-and-forth``, ``own`` (that of ``view:FILE``), or a
-            number from 0 to 1; None for back-and-forth, or the times of a camera path.
+            number from 0 to 1; None for ``own`` in a single image of a view, for the times of a
+            camera path, or for back-and-forth.
         frames: Number of frames; None for 48, for 1 if neither camera nor time moves, or for one
             per camera of a camera path.
         fps: Frames per second; None for 16, or the rate in the camera path.
@@ -56,6 +55,8 @@ class VideoOptions:
             are square.
         elevation: Elevation of orbit and fixed camera, in degrees.
         what: ``colour`` or ``depth``.
+        out: A file (.webp, .mp4, .png, .jpg), or a folder if it ends in /; None for a file in the
+            run's media/ that is named after the options.
     """
 
     path: str = "orbit"
@@ -65,12 +66,13 @@ class VideoOptions:
     size: int | None = None
     elevation: float = ELEVATION
     what: str = "colour"
+    out: str | None = None
 
-    def written_to(self, out: str | None) -> "VideoOptions":
-        """The options for output to ``out``: a single image of a view gets the view's time."""
-        one = self.frames in (None, 1) and self.path.startswith("view:") and self.time is None
-        image = out is not None and Path(out).suffix in IMAGES and not Path(out).is_dir()
-        return replace(self, time=OWN) if one and image else self
+    def __post_init__(self) -> None:
+        out = Path(self.out or "")
+        one_image = out.suffix in IMAGES and not out.is_dir() and self.frames in (None, 1)
+        if one_image and self.path.startswith("view:") and self.time is None:
+            object.__setattr__(self, "time", OWN)
 
     @cached_property
     def cameras(self) -> CameraPath | None:
@@ -129,12 +131,26 @@ class VideoOptions:
         name = self.path.removeprefix("view:")
         return None if name == self.path else find_view(splits, name)
 
+    def destination(self, run: Path, checkpoint: str) -> tuple[Path, bool]:
+        """The file or folder to write, and whether it is a folder."""
+        if self.out is not None:
+            return Path(self.out), self.out.endswith("/") or Path(self.out).is_dir()
+        if self.cameras is not None:
+            parts = ["render", Path(self.path).stem, *([self.time] if self.time else [])]
+        else:
+            camera = self.path.replace(":", "_").replace("/", "_").removesuffix(".png")
+            parts = ["render", camera, self.time or "back-and-forth"]
+        parts += [part for part in (self.what, checkpoint) if part not in ("colour", "last")]
+        ending = ".png" if self.count == 1 else ".webp"
+        return run / "media" / ("_".join(parts) + ending), False
+
     def check(self) -> None:
         """Check the options without a run.
 
         Raises:
             ConfigError: If an option is invalid; the message says what is allowed.
             SceneError: If a camera path cannot be used.
+            ImportError: For .mp4 without the extra ``video``.
         """
         views = self.path.startswith("view:")
         if self.time != OWN:
@@ -160,16 +176,16 @@ class VideoOptions:
                 raise ConfigError(
                     f"{self.path} asks for frames of {longer} px: set --size to at most {LARGEST}"
                 )
+        target, folder = self.destination(Path(), "last")
+        check_video(target, frames=self.count, folder=folder)
 
 
-def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = None) -> Path:
+def render_video(trained: TrainedRun, options: VideoOptions) -> Path:
     """Render and write a video.
 
     Args:
         trained: The run.
-        options: Cameras, times and size of the frames.
-        out: A file (.webp, .mp4, .png, .jpg), or a folder if it ends in /; None for a file in the
-            run's media/ that is named after the options.
+        options: Cameras, times and size of the frames, and where to write them.
 
     Returns:
         The file or folder that was written.
@@ -178,60 +194,25 @@ def render_video(trained: TrainedRun, options: VideoOptions, out: str | None = N
         ConfigError: If options are out of range or contradict one another.
         ImportError: For .mp4 without the extra ``video``.
     """
-    options = options.written_to(out)
     options.check()
-    check_out(out, options)
-    target, folder = destination(trained.path, options, out, trained.checkpoint)
+    target, folder = options.destination(trained.path, trained.checkpoint)
     require_writable(target.parent)
-    if options.time == OWN and (found := options.view(trained.scene.splits)) is not None:
+    splits = trained.scene.splits
+    if options.time == OWN and (found := options.view(splits)) is not None:
         views, index = found
         options = replace(options, time=str(float(views.times[index])))
-    frames = _frames(trained.module, trained.scene, options)
-    counted = tqdm(frames, "frames", options.count, leave=False, delay=2, disable=None)
-    return write_video(target, counted, fps=options.rate, folder=folder)
-
-
-def _frames(module: RadianceModule, scene: Scene, options: VideoOptions) -> Iterator[Tensor]:
-    frame, splits = module.frame, scene.splits
-    assert frame is not None
-    return render_path(
-        module.field,
-        module.renderer,
-        frame,
-        cameras(options, splits, frame),
+    frames = render_path(
+        trained.module.field,
+        trained.module.renderer,
+        trained.frame,
+        cameras(options, splits, trained.frame),
         options.times,
-        background=scene.background,
+        background=trained.scene.background,
         what=options.what,
         shown=pixels_with_rays(options, splits),
     )
-
-
-def check_out(out: str | None, options: VideoOptions) -> None:
-    """Check ``--out`` before the run is loaded.
-
-    Raises:
-        ConfigError: As `check_video`.
-        ImportError: For .mp4 without the extra ``video``.
-    """
-    options = options.written_to(out)
-    target, folder = destination(Path(), options, out, "last")
-    check_video(target, frames=options.count, folder=folder)
-
-
-def destination(
-    run: Path, options: VideoOptions, out: str | None, checkpoint: str
-) -> tuple[Path, bool]:
-    """The file or folder to write, and whether it is a folder."""
-    if out is not None:
-        return Path(out), out.endswith("/") or Path(out).is_dir()
-    if options.cameras is not None:
-        parts = ["render", Path(options.path).stem, *([options.time] if options.time else [])]
-    else:
-        camera = options.path.replace(":", "_").replace("/", "_").removesuffix(".png")
-        parts = ["render", camera, options.time or "back-and-forth"]
-    parts += [part for part in (options.what, checkpoint) if part not in ("colour", "last")]
-    ending = ".png" if options.count == 1 else ".webp"
-    return run / "media" / ("_".join(parts) + ending), False
+    counted = tqdm(frames, "frames", options.count, leave=False, delay=2, disable=None)
+    return write_video(target, counted, fps=options.rate, folder=folder)
 
 
 def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> list[PosedCamera]:

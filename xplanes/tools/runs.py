@@ -53,11 +53,6 @@ class TrainedRun:
         """The views of the split."""
         return self.scene.splits[self.split]
 
-    @property
-    def is_static(self) -> bool:
-        """Whether the field is static."""
-        return not self.module.field.moves
-
 
 def find_run(path: Path, outputs: Path = OUTPUTS) -> Path:
     """Check that ``path`` is a run directory.

@@ -226,9 +226,9 @@ def _part(strip: Image.Image, place: int, size: int) -> Image.Image:
 
 def _score(strip: Image.Image) -> float:
     """PSNR of the second picture of a strip against the first."""
-    width = strip.width // len(STRIP)
-    both = torch.from_numpy(np.array(strip)).float() / 255
-    return psnr(both[:, width : 2 * width], both[:, :width])
+    whole = torch.from_numpy(np.array(strip)).float() / 255
+    truth, prediction, *_ = whole.chunk(len(STRIP), dim=1)
+    return psnr(prediction, truth)
 
 
 def _video(lines: Sequence[Line]) -> Iterator[Image.Image]:

@@ -107,7 +107,7 @@ def read_rows(folder: Path) -> list[RunRow]:
         raise ConfigError(f"{folder} is not a folder")
     rows, groups = [], list(_groups(folder))
     for place, runs in groups:
-        rows += [read_run(run, _name(run, folder)) for run in runs]
+        rows += [read_run(run, folder) for run in runs]
         below = [run for other, its in groups if other.is_relative_to(place) for run in its]
         rows += _missing_jobs(place, folder, [run_overrides(run) for run in below])
     if not rows:
@@ -120,10 +120,6 @@ def read_rows(folder: Path) -> list[RunRow]:
         return name if name in known else key
 
     return [replace(r, settings={full(k): v for k, v in r.settings.items()}) for r in rows]
-
-
-def _name(path: Path, folder: Path) -> str:
-    return str(path.relative_to(folder)) if path != folder else path.resolve().name
 
 
 def _groups(folder: Path) -> Iterator[tuple[Path, list[Path]]]:
@@ -144,8 +140,8 @@ def _is_job(folder: Path) -> bool:
     return any((folder / name).is_file() for name in names)
 
 
-def read_run(run: Path, name: str) -> RunRow:
-    """Read one run directory."""
+def read_run(run: Path, folder: Path) -> RunRow:
+    """Read one run directory in ``folder``, or ``folder`` itself."""
     problems: list[str] = []
     has_config = (run / "config.yaml").exists()
     config = _mapping(run / ("config.yaml" if has_config else ".hydra/config.yaml"), problems)
@@ -167,7 +163,7 @@ def read_run(run: Path, name: str) -> RunRow:
     parts = parts if isinstance(parts, dict) else {}
     device = record.get("device")
     return RunRow(
-        name=name,
+        name=str(run.relative_to(folder)) if run != folder else run.resolve().name,
         # Configurations of jobs that never began have unresolved interpolations.
         settings={key: value for key, value in settings.items() if "${" not in str(value)},
         overridden=frozenset(key_and_value(line)[0] for line in run_overrides(run)),
@@ -229,14 +225,12 @@ def _status(record: dict[str, Any] | None, metrics: dict[str, Any] | None) -> st
 
 
 def _scores(metrics: dict[str, Any]) -> dict[str, float]:
-    found = {}
+    flat, found = flatten(metrics), {}
     for name, score in SCORES.items():
-        value: Any = metrics
-        for key in score.place.split("."):
-            value = value.get(key) if isinstance(value, dict) else None
-        parts = list(value.values()) if isinstance(value, dict) else [value]
+        # A score may be the sum of several numbers, such as the seconds of all stages.
+        parts = [flat[key] for key in flat if f"{key}.".startswith(f"{score.place}.")]
         if parts and all(map(is_number, parts)):
-            found[name] = sum(parts) if isinstance(value, dict) else value
+            found[name] = sum(parts)
     return found
 
 

@@ -1,7 +1,7 @@
 """Triplanes from images, and a turntable video of them: `xplanes triplanes`."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
@@ -18,6 +18,7 @@ from xplanes.preparation.cache import StageCache
 from xplanes.preparation.encode import encode
 from xplanes.preparation.reconstruct import ImageLRMSettings, picture_crop
 from xplanes.preparation.sequence import TriplaneSequence, save_triplanes
+from xplanes.process import say
 from xplanes.rendering.grid_renderer import DIAGONAL, GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.cameras import PosedCamera, camera_around
@@ -30,16 +31,13 @@ FRAMES, FPS, SIDE = 48, 16, 224
 SAMPLES, CELLS = 192, 64
 
 
-def write_triplanes(
-    paths: Sequence[Path], out: Path, experiment: Experiment, *, say: Callable[[str], None]
-) -> Path:
+def write_triplanes(paths: Sequence[Path], out: Path, experiment: Experiment) -> Path:
     """Encode images into triplanes; write them and a turntable video.
 
     Args:
         paths: Images, or folders of them.
         out: File to write, .safetensors or .pt; the video has the same name with .webp.
         experiment: Settings of the LRM, the cache and the device; others are ignored.
-        say: Receives progress messages.
 
     Returns:
         The video file.

@@ -7,7 +7,6 @@ import socket
 import threading
 import time
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,6 @@ from torch import Tensor
 from xplanes.errors import ConfigError
 from xplanes.evaluation.render import orbit_poses
 from xplanes.optional import require
-from xplanes.rendering.base import Renderer
 from xplanes.rendering.pictures import colour_map, to_bytes
 from xplanes.scenes.views import Scene
 from xplanes.tools.drawing import MODES, Picture, Shot, camera_outlines, draw
@@ -105,7 +103,6 @@ class Viewer:
     Args:
         module: The module with its field built.
         scene: The scene.
-        renderer: Function that returns the renderer for the next picture.
         host: Address to listen on.
         port: Port to listen on; the next free one if it is taken.
         trains: Whether the field is in training, which can then be paused.
@@ -123,7 +120,6 @@ class Viewer:
         self,
         module: RadianceModule,
         scene: Scene,
-        renderer: Callable[[], Renderer],
         *,
         host: str = HOST,
         port: int = PORT,
@@ -131,7 +127,7 @@ class Viewer:
     ) -> None:
         viser: Any = require("viser", extra="viewer")
         assert module.frame is not None
-        self.module, self.scene, self.renderer = module, scene, renderer
+        self.module, self.scene = module, scene
         self.frame, self.views = module.frame, scene.splits["train"]
         self.patience, self.trains = math.inf, trains
         self.step, self.paused, self.playing = 0, False, False
@@ -206,11 +202,6 @@ class Viewer:
         """Least and largest corner of the crop; None for the whole cube. [2, 3]"""
         ends = torch.tensor([slider.value for slider in self.crop], dtype=torch.float32).T
         return None if bool((ends.abs() == 1).all()) else ends
-
-    @property
-    def needs_depth(self) -> bool:
-        """Whether lines are shown, which the scene may occlude."""
-        return bool(self.cameras.value or self.outline.visible)
 
     def _place_camera(self) -> None:
         """Place the initial camera behind the training camera nearest to the start of the orbit."""
@@ -368,10 +359,10 @@ class _Browser:
         """Render and send a picture; unless it shows a change itself, a new change abandons it."""
         viewer, version = self.viewer, self.version
         resting = version == self.drawn
-        field, shot = viewer.module.field, viewer.shot(self.client.camera, height)
+        shot = viewer.shot(self.client.camera, height)
         picture = draw(
-            field,
-            viewer.renderer(),
+            viewer.module.field,
+            viewer.module.renderer,
             shot,
             views=viewer.views,
             frame=viewer.frame,
@@ -389,11 +380,11 @@ class _Browser:
         self.again = now + max(REFRESH_SECONDS, SHARE * spent)
 
     def _send(self, picture: Picture) -> None:
-        hides = self.viewer.needs_depth
-        depth = picture.depth.clamp_max(LARGEST_DEPTH).numpy() if hides else None
+        # The scene may occlude the lines of cameras and crop.
+        has_lines = self.viewer.cameras.value or self.viewer.outline.visible
         self.client.scene.set_background_image(
             to_bytes(picture.colours).numpy(),
             format="jpeg",
             jpeg_quality=92 if self.sharp else 75,
-            depth=depth,
+            depth=picture.depth.clamp_max(LARGEST_DEPTH).numpy() if has_lines else None,
         )

@@ -2,7 +2,7 @@
 
 import math
 
-MODELS = ("perspective", "fisheye", "fov")
+MODELS = ("perspective", "fisheye", "fov", "polynomial")
 
 
 def distort(model, x, y, k):
@@ -14,7 +14,7 @@ def distort(model, x, y, k):
             return 0.0, 0.0
         distorted = math.atan(2 * r * math.tan(k["omega"] / 2)) / k["omega"]
         return x * distorted / r, y * distorted / r
-    if model == "fisheye":
+    if model in ("fisheye", "polynomial"):
         factor = 1 + k["k1"] * r**2 + k["k2"] * r**4 + k["k3"] * r**6 + k["k4"] * r**8
     else:
         factor = (1 + k["k1"] * r**2 + k["k2"] * r**4 + k["k3"] * r**6) / (

@@ -447,7 +447,7 @@ def test_lenses_that_are_not_read(scene):
     whole, frame = scene.contents["train"], dict(scene.frame(1))
     for other, words in (
         ({"p2": "a"}, "p2 is 'a'; a distortion coefficient must be a number"),
-        ({"k4": -1e-3}, "k4=-0.001 may mean.*FULL_OPENCV"),
+        ({"ftheta_p0": 0.0, "ftheta_p1": 1e-3}, "ftheta_p0=0.0 is not a lens"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model=EQUIRECTANGULAR.*undistort"),
         ({"camera_model": "FISHEYE624", "fl_x": 9}, "camera_model=FISHEYE624"),
         ({"latlong": True}, "latlong=True"),

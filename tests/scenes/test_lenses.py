@@ -30,6 +30,7 @@ LENSES = {
         "perspective",
         {"k1": 0.9, "k2": 0.3, "k3": 0.02, "k4": 1.0, "k5": 0.3, "k6": 0.02},
     ),
+    "polynomial": ("polynomial", {"k1": 0.1, "k2": -0.05, "k3": 0.04, "k4": 0.03, "p1": 0.01}),
     "prism": ("perspective", {"s1": 0.02, "s2": -0.01, "s3": -0.015, "s4": 0.01}),
     "equidistant": ("fisheye", {}),
     "fisheye": ("fisheye", {"k1": 0.05, "k2": -0.02, "k3": 0.004, "k4": -0.0005}),

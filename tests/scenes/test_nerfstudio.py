@@ -99,6 +99,8 @@ def test_a_capture_equals_what_it_was_written_from(capture):
         ({"camera_model": "OPENCV", "k1": -0.2, "k2": 0.05, "p1": 0.01, "p2": -0.02}, None),
         ({"camera_model": "SIMPLE_RADIAL", "k1": 0.15}, None),
         ({"camera_model": "FULL_OPENCV", "k1": 0.3, "k4": 0.2, "k5": 0.02}, None),
+        ({"camera_model": "OPENCV", "k1": -0.05, "k3": 0.01, "k4": 0.004}, "polynomial"),
+        ({"distortion_params": [0.1, 0.0, 0.01, 0.02, 0.001, -0.002]}, "polynomial"),
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.03, "k2": 0.005, "k4": 1e-4}, "fisheye"),
         ({"is_fisheye": True, "k1": 0.03}, "fisheye"),
         ({"distortion_params": [0.15, 0.02, 0.0, 0.0, 0.001, -0.002]}, None),
@@ -655,6 +657,63 @@ def test_a_world_whose_y_axis_is_up_is_turned(capture, keys, setting, is_turned)
     up = scene.splits["train"].camera_to_world[:, :3, 1].mean(dim=0)
     assert bool(up[2] > 0.99 * up.norm()) is is_turned
     assert ("the world is turned, as it is" in scene.notes["up"]) is is_turned
+
+
+def test_the_up_vector_of_instant_ngp_is_the_worlds(capture):
+    capture.content["up"] = [0.0, 2.0, 0.0]
+    scene = capture.read()
+    assert scene.notes["up"] == "(0, 1, 0) of the files, by their key up"
+    stated = np.array([f["transform_matrix"] for f in capture.frames])[:, 1, :3]
+    found = scene.splits["train"].camera_to_world[:, 2, :3]
+    np.testing.assert_allclose(found.numpy(), stated[numbers(scene.splits["train"])], atol=1e-6)
+    assert "mean up vector" in capture.read(orient=False).notes["up"]
+    capture.content["up"] = [0, 0, "z"]
+    assert "mean up vector" in capture.read().notes["up"]
+
+
+def test_positions_in_map_coordinates_are_read_relative_to_their_mean(capture):
+    near = capture.read().splits["train"]
+    for frame in capture.frames:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] += [691_607.0, 5_334_760.0, 520.0]
+        frame["transform_matrix"] = pose.tolist()
+    with pytest.warns(UserWarning, match=r"relative to \(691606, 5334760, 522\)"):
+        found = capture.read().splits["train"]
+    shift = (found.camera_to_world - near.camera_to_world)[:, :3, 3]
+    torch.testing.assert_close(found.camera_to_world[:, :, :3], near.camera_to_world[:, :, :3])
+    torch.testing.assert_close(shift, shift[:1].expand_as(shift), atol=1e-5, rtol=0)
+    assert float(shift.abs().max()) < 5
+    capture.frames[0]["transform_matrix"][0][3] = 1e30
+    capture.refused("which single precision cannot resolve")
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"n_frames": 6}, "n_frames=6 makes instant-ngp read the first 6 of 10 frames"),
+        ({"sharpness_discard_threshold": 0.5}, "sharpness_discard_threshold=0.5 makes instant-ngp"),
+        ({"n_frames": 10, "sharpness_discard_threshold": 0.0}, ""),
+    ],
+)
+def test_what_instant_ngp_would_leave_out_is_told(capture, keys, words):
+    capture.content |= keys
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        capture.read()
+    assert [words in str(each.message) for each in caught] == [True] * bool(words)
+
+
+def test_smaller_copies_stand_in_for_images_that_are_missing(capture):
+    whole = capture.read(resolution=12).splits["train"]
+    (capture.path / "images").rename(capture.path / "images_4")
+    with pytest.warns(UserWarning, match=r"10 of 10 images are missing and read from smaller"):
+        found = capture.read(resolution=12).splits["train"]
+    assert found.files[0].startswith("images_4/")
+    for mine, theirs in zip(found.image_rays(1), whole.image_rays(1), strict=True):
+        torch.testing.assert_close(mine, theirs)
+    for key in ("w", "h"):
+        del capture.content[key]
+    capture.refused("no image .*images/frame_00000", error=MissingSplitError)
 
 
 def test_a_vertical_field_of_view_beside_a_focal_length(capture):

@@ -39,7 +39,7 @@ from xplanes.tools.inspect import (
     next_command,
     table,
 )
-from xplanes.tools.inspect_picture import HEIGHT, POINT, WIDTH, draw
+from xplanes.tools.inspect_picture import HEIGHT, POINT, WIDTH, _chosen, draw
 
 SIZE, COUNT, HELD = 32, 16, 4
 
@@ -390,6 +390,25 @@ def test_cameras_are_told_apart_by_poses_or_lenses(inspected):
     focal[1::2] *= 1.5
     two = replace(views, files=files, intrinsics=replace(views.intrinsics, focal=focal))
     assert [group.name for group in cameras_of(two)] == ["cam00", "cam01"]
+
+
+def test_the_picture_shows_each_camera_of_a_rig(inspected):
+    capture = inspected(ball(poses=rig(4)))
+    train = capture.scene.splits["train"]
+    shown = [index for split, index in _chosen(capture) if split == "train"]
+    of = {index: n for n, group in enumerate(cameras_of(train)) for index in group.indices}
+    assert len({of[index] for index in shown}) == min(4, len(shown))
+    assert len({float(train.times[index]) for index in shown}) > 1
+
+
+def test_what_the_reader_says_is_a_warning(tmp_path, capsys):
+    write_nerfstudio(tmp_path / "ball", ball().splits["train"], n_frames=4)
+    assert main(["inspect", str(tmp_path / "ball"), "--out", str(tmp_path / "a.png")]) == 0
+    printed = capsys.readouterr()
+    assert "warning (files)" in printed.out
+    assert "n_frames=4" in printed.out
+    assert "no warnings" not in printed.out
+    assert "n_frames" not in printed.err
 
 
 def test_distortion_is_how_far_the_oracle_moves_a_corner():

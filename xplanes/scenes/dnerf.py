@@ -77,7 +77,9 @@ def _listed(split: str, path: Path, span: tuple[float, float] | None) -> Listing
         return listing_of(path, read_frames(path), span)
     except MissingSplitError as problem:
         if split != "train":
-            warn(f"The {split} split is left out. {problem}")
+            first, *others = str(problem).splitlines()  # BlenderNeRF writes cameras without images.
+            more = " No other frame of it can be used either." if others else ""
+            warn(f"The {split} split is left out. {first}{more}")
         raise
 
 

@@ -374,7 +374,7 @@ UP = {3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 
 
 def world_turn(
-    poses: Tensor, paths: Sequence[Path], orient: bool | None
+    poses: Tensor, paths: Sequence[Path], orient: bool | None, stated: Tensor | None = None
 ) -> tuple[Tensor | None, str]:
     """Rotation of the world that makes the cameras' mean up vector its z axis, and a description.
 
@@ -384,11 +384,15 @@ def world_turn(
         poses: Cameras with OpenGL's axes. [V, 4, 4]
         paths: Their images; empty for frames of videos. [V]
         orient: Whether to rotate the world. None rotates it if the mean up vector is more than
-            `FAR_OFF` degrees from the z axis.
+            `FAR_OFF` degrees from the z axis, or as ``stated``.
+        stated: The up vector that the files give, if any. float64 [3]
 
     Returns:
         The rotation, float64 [3, 3], or None if the world is unchanged; and a description.
     """
+    if stated is not None and orient is None:
+        x, y, z = stated.tolist()
+        return upright(stated[None]), f"({x:g}, {y:g}, {z:g}) of the files, by their key up"
     tags = [orientation(path) for path in paths] or [1] * len(poses)
     if turned_photos := sum(tag in UP for tag in tags):
         logger.info(
@@ -432,8 +436,8 @@ def require_precision(source: Path, positions: np.ndarray) -> None:
     if not largest <= min(room, FARTHEST):
         raise SceneError(
             f"{source}: the cameras lie up to {largest:.3g} world units from the origin and "
-            f"{extent:.3g} apart, which single precision cannot resolve. Move the capture to the "
-            "origin first, as with colmap model_transformer, or correct the cameras."
+            f"{extent:.3g} apart, which single precision cannot resolve. Subtract the same vector "
+            "from the positions of all cameras, as colmap model_transformer does, or correct them."
         )
 
 

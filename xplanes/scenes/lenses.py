@@ -22,13 +22,15 @@ class LensModel(IntEnum):
     """Equidistant: OPENCV_FISHEYE, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, THIN_PRISM_FISHEYE."""
     FOV = 2
     """One angle, omega, stored in place of k1."""
+    POLYNOMIAL = 3
+    """Perspective, with k4 as the coefficient of r^8: nerfstudio, Metashape, RealityCapture."""
 
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
 """Distortion coefficients by their names in OpenCV: radial, tangential, thin prism.
 
-For perspective lenses k4 to k6 are in the denominator. A fisheye lens has no k5 and k6; its k4 is
-the coefficient of theta^8, and COLMAP's sx1 and sy1 are s1 and s3.
+For perspective lenses k4 to k6 are in the denominator. Fisheye and polynomial lenses have no k5 and
+k6; their k4 is the coefficient of the eighth power. COLMAP's sx1 and sy1 are s1 and s3.
 """
 
 STEEPEST = 1e3
@@ -283,7 +285,7 @@ def _terms(lenses: Lenses) -> list[Tensor]:
     """Coefficients of the radial numerator (4) and denominator (3), then p and s. [V] each"""
     k1, k2, k3, k4, k5, k6, *others = lenses.coefficients.unbind(dim=1)
     none = torch.zeros_like(k1)
-    if lenses.model[0] == LensModel.FISHEYE:
+    if lenses.model[0] in (LensModel.FISHEYE, LensModel.POLYNOMIAL):
         return [k1, k2, k3, k4, none, none, none, *others]
     return [k1, k2, k3, none, k4, k5, k6, *others]
 

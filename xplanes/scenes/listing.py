@@ -437,7 +437,7 @@ def _require_rays(
         fault = (
             f"{label}: its {lens.description} folds back inside the image: no direction belongs to "
         )
-        if lens.model != LensModel.PERSPECTIVE and share < 1:
+        if lens.model not in (LensModel.PERSPECTIVE, LensModel.POLYNOMIAL) and share < 1:
             continue
         if share <= MOST_FOLDED:
             folded.append((share, f"{fault}{share:.1%} of the pixels, which are left out"))

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from xplanes.errors import ConfigError, MissingSplitError, SceneError, warn
 from xplanes.scenes.entries import some, world_turn
@@ -326,6 +327,7 @@ class CaptureSettings(SceneSettings, ABC):
         splits: Sequence[str],
         source: Path,
         points: np.ndarray | None = None,
+        up: Tensor | None = None,
     ) -> Scene:
         """The requested splits of a capture.
 
@@ -335,6 +337,7 @@ class CaptureSettings(SceneSettings, ABC):
             splits: Names of splits.
             source: Source of the splits, for messages.
             points: World points on surfaces. [N, 3]
+            up: The world's up vector, if the files give one. float64 [3]
 
         Raises:
             MissingSplitError: If a split has no images.
@@ -350,11 +353,11 @@ class CaptureSettings(SceneSettings, ABC):
                 )
         if not any(listing.masks):
             warn_of_masks(self.folder, listing.paths)
-        turn, up = world_turn(listing.camera_to_world, listing.paths, self.orient)
+        turn, words = world_turn(listing.camera_to_world, listing.paths, self.orient, up)
         found = None if points is None else torch.from_numpy(points)
         if turn is not None:
             listing = listing.turned(turn)
             found = None if found is None else found @ turn.T
         parts = self.thinned({split: listing.subset(places[split]) for split in splits})
         found = None if found is None else found.float()
-        return self.scene_of(parts, self.mask_use, listing, up, points=found)
+        return self.scene_of(parts, self.mask_use, listing, words, points=found)

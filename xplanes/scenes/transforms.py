@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,8 +49,11 @@ PERSPECTIVES = (
 OTHER_AXES = ("from_mitsuba", "normal_mts_args", "from_na")
 """Keys of instant-ngp and NeuS2 for poses with axes other than OpenGL's."""
 
-OTHER_LENSES = ("equirectangular", "latlong", "orthographic", "ftheta_p0")
-"""Keys of unsupported lenses in files of instant-ngp."""
+OTHER_LENSES = ("equirectangular", "latlong", "orthographic")
+"""Flags of unsupported lenses in files of instant-ngp."""
+
+FTHETA = "ftheta_p"
+"""Beginning of the keys of instant-ngp's f-theta lens, whose first coefficient is usually 0."""
 
 TIMES = ("time", "timestamp")
 """Keys of times; the first one that a frame has is used."""
@@ -80,20 +83,21 @@ TRANSPARENT = {"white_transparent": 255, "black_transparent": 0}
 
 KNOWN = (
     *("frames", "file_path", "transform_matrix", "transform_matrix_start", "mask_path"),
-    *("camera_model", "is_fisheye", "distortion_params", "orientation_override"),
+    *("camera_model", "is_fisheye", "distortion_params", "orientation_override", "up"),
+    *("n_frames", "sharpness_discard_threshold"),
     *("train_filenames", "val_filenames", "test_filenames"),
     *(*NUMBERS, *OTHER_LENSES, *OTHER_AXES, *TRANSPARENT),
 )
 """Keys that are read, or refused."""
 
 IGNORED = (
-    *("aabb", "aabb_scale", "offset", "scale", "up", "applied_transform", "applied_scale"),
-    *("auto_scale_poses_override", "ply_file_path", "sharpness", "sharpness_discard_threshold"),
+    *("aabb", "aabb_scale", "offset", "scale", "applied_transform", "applied_scale"),
+    *("auto_scale_poses_override", "ply_file_path", "sharpness"),
     *("n_extra_learnable_dims", "importance_sampling", "enable_ray_loading", "fix_premult"),
     *("colmap_im_id", "colmap_image_id", "camera_id", "cam_id", "component_id", "id", "name"),
     *("depth_file_path", "depth_path", "integer_depth_scale", "enable_depth_loading"),
     *("normal_file_path", "depth_unit_scale_factor", "rotation", "render_aabb", "path"),
-    *("crop_width", "crop_height", "blur_score", "n_images", "n_frames", "fps"),
+    *("crop_width", "crop_height", "blur_score", "n_images", "fps"),
 )
 """Keys of other programs without effect here."""
 
@@ -174,11 +178,19 @@ def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame
     entries = content["frames"]
     key = _key(entries)
     timed = sum(entry.get(key) is not None for entry in entries)
+    smaller: list[Path] = []
 
     def read(item: tuple[int, dict[str, Any]]) -> _Frame:
         index, entry = item
         label = f"{path}: frame {index} ({entry['file_path']})"
-        image = image_path(label, folder, entry["file_path"])
+        try:
+            image = image_path(label, folder, entry["file_path"])
+        except BrokenFrameError:
+            sized = entry.get("w") or content.get("w")  # Else focal lengths would be wrong.
+            found = _downscaled(folder, entry["file_path"]) if sized else None
+            if found is None:
+                raise
+            smaller.append(image := found)
         pose = checked_pose(label, entry["transform_matrix"])
         mask = entry.get("mask_path") or content.get("mask_path") or None
         mask = None if mask is None else image_path(label, folder, mask, "mask_path")
@@ -192,7 +204,37 @@ def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame
             )
         return _Frame(label, entry, image, mask, pose)
 
-    return [frame for _, frame in usable("frames", read, [*enumerate(entries)])]
+    frames = [frame for _, frame in usable("frames", read, [*enumerate(entries)])]
+    if smaller:
+        warn(
+            f"{path}: {len(smaller)} of {len(entries)} images are missing and read from smaller "
+            f"copies, such as {smaller[0]}."
+        )
+    _warn_of_selection(path, content)
+    return frames
+
+
+def _downscaled(folder: Path, name: str) -> Path | None:
+    """The largest of nerfstudio's smaller copies of an image, as in images_2; None without any."""
+    wanted = PurePosixPath(name)
+    copies = (folder / f"{wanted.parent}_{factor}" / wanted.name for factor in (2, 4, 8))
+    return next((copy for copy in copies if wanted.parent.name and copy.is_file()), None)
+
+
+def _warn_of_selection(path: Path, content: Mapping[str, Any]) -> None:
+    """Warn if instant-ngp would leave out frames of the file."""
+    count, frames = content.get("n_frames"), len(content["frames"])
+    if is_positive(count) and count < frames:
+        warn(
+            f"{path}: n_frames={count:g} makes instant-ngp read the first {count:g} of {frames} "
+            "frames in the order of their names; all are read here. Take the others out of the "
+            "list to leave them out."
+        )
+    if is_positive(least := content.get("sharpness_discard_threshold")):
+        warn(
+            f"{path}: sharpness_discard_threshold={least:g} makes instant-ngp leave out blurred "
+            "frames; all are read here. Take them out of the list to leave them out."
+        )
 
 
 def _masks_beside(paths: Sequence[Path]) -> tuple[list[Path | None], str]:
@@ -426,7 +468,7 @@ def read_calibration(
     bare = Calibration(model=model, distortion=distortion)
     if "fl_x" in known:
         return replace(bare, **known)
-    if model != LensModel.PERSPECTIVE:
+    if model in (LensModel.FISHEYE, LensModel.FOV):
         raise SceneError(
             f'{label}: a {model.name.lower()} lens needs "fl_x", its focal length in pixels. Add '
             "it to the file or to the frame."
@@ -470,9 +512,9 @@ def _lens(
     """The kind of lens of a frame, and its distortion; empty if it has none."""
     model, name, found = LensModel.PERSPECTIVE, "", {}
     for source, keys in ((where, content), (label, frame)):
-        for key in OTHER_LENSES:
-            if keys.get(key):
-                raise _not_read(source, f"{key}={short(keys[key])}")
+        for key, value in keys.items():
+            if (key in OTHER_LENSES and value) or (key.startswith(FTHETA) and value is not None):
+                raise _not_read(source, f"{key}={short(value)}")
         if keys.get("camera_model"):
             name = str(keys["camera_model"]).upper()
             model = _model(source, name)
@@ -497,12 +539,9 @@ def _lens(
                 f"{omega:g}. Correct it, or set camera_model to PINHOLE."
             )
         return model, (omega,)
-    if model == LensModel.PERSPECTIVE and found.get("k4") and name != "FULL_OPENCV":
-        raise SceneError(
-            f"{label}: k4={found['k4']:g} may mean the 8th power of the radius, as in nerfstudio, "
-            "or a denominator, as in OpenCV. Set camera_model to FULL_OPENCV for the latter or to "
-            "OPENCV_FISHEYE for a fisheye lens; otherwise calibrate without k4."
-        )
+    rational = name == "FULL_OPENCV" or found.get("k5") or found.get("k6")
+    if model == LensModel.PERSPECTIVE and found.get("k4") and not rational:
+        model = LensModel.POLYNOMIAL
     distortion = tuple(found.get(key, 0.0) for key in COEFFICIENTS)
     return model, distortion if any(distortion) else ()
 

@@ -3,6 +3,7 @@
 import functools
 import math
 import shlex
+import warnings
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -186,8 +187,11 @@ def inspect(choice: Choice) -> Capture:
     Raises:
         SceneError: If it cannot be used.
     """
-    choice.scene.prepare()
-    scene, model = choice.scene.read(), choice.model
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        choice.scene.prepare()
+        scene, model = choice.scene.read(), choice.model
+    said = dict.fromkeys(str(each.message) for each in caught if each.category is UserWarning)
     train = scene.splits["train"]
     frame, problem = None, ""
     try:
@@ -197,7 +201,8 @@ def inspect(choice: Choice) -> Capture:
     images = {
         split: image_facts(views, scene.background, frame) for split, views in scene.splits.items()
     }
-    findings = [*camera_findings(scene, frame), *image_findings(scene, images)]
+    findings = [Finding("files", text) for text in said]
+    findings += [*camera_findings(scene, frame), *image_findings(scene, images)]
     texels = None
     if frame is not None:
         pixels = pixels_across(train, frame)
@@ -365,7 +370,10 @@ def table(capture: Capture) -> str:
     ]
     text += [f"{name:<7} {words}" for name, words in known["notes"].items()]
     if known["video_frames"]:
-        text.append(f"video   {known['video_frames']} frames of a fixed camera")
+        video = capture.scene.video
+        plain = video is not None and video.is_opaque and capture.scene.is_surrounded
+        why = ", without silhouettes: lrm=auto leaves them out" if plain else ""
+        text.append(f"video   {known['video_frames']} frames of a fixed camera{why}")
     if known["static_reason"]:
         text.append(f"static  {known['static_reason']}")
     elif known["splits"]["train"]["timesteps"] == 1:

@@ -299,13 +299,17 @@ def _samples(sheet: _Sheet, box: Box, capture: Capture) -> None:
 
 
 def _chosen(capture: Capture) -> list[tuple[str, int]]:
-    """Views to show: training views spread over the times, and one of each other split."""
+    """Views to show: training views of different cameras and times, one of each other split."""
     splits = capture.scene.splits
     others = [(split, len(views) // 2) for split, views in splits.items() if split != "train"]
     train = splits["train"]
-    by_time = train.times.argsort(stable=True).tolist()
-    ranks = _middles(SAMPLES - len(others), len(train))
-    return [*(("train", by_time[rank]) for rank in ranks), *others]
+    groups, count, chosen = cameras_of(train), min(SAMPLES - len(others), len(train)), []
+    for number in range(count):
+        share = (number + 0.5) / count
+        place = number % len(groups) if len(groups) < count else round(share * len(groups) - 0.5)
+        views = sorted(groups[place].indices, key=lambda index: float(train.times[index]))
+        chosen.append(views[round(share * len(views) - 0.5)])
+    return [*(("train", index) for index in dict.fromkeys(chosen)), *others]
 
 
 def _middles(count: int, total: int) -> list[int]:

@@ -1,9 +1,13 @@
 """Lets every test import `tests.oracles`, from wherever pytest is started."""
 
+import copy
+import functools
 import gc
+import io
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from xplanes.process import defaults
 
@@ -68,6 +72,28 @@ def short_videos() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(write, "VIDEO_FRAMES", VIDEO_FRAMES)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def yaml_read_once() -> Iterator[None]:
+    """Hundreds of compositions open the same files: each text is parsed once."""
+    from omegaconf import OmegaConf
+
+    load = OmegaConf.load
+    parsed = functools.cache(lambda text: load(io.StringIO(text)))
+
+    def read(file: Any) -> Any:
+        if not hasattr(file, "read"):
+            return load(file)
+        try:
+            return copy.deepcopy(parsed(file.read()))
+        except Exception:  # Which names the file if it is read as such.
+            file.seek(0)
+            return load(file)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OmegaConf, "load", staticmethod(read))
         yield
 
 

@@ -20,7 +20,7 @@ from lightning.pytorch.callbacks import (
 )
 from lightning.pytorch.loggers import CSVLogger, Logger
 
-from tests.training.runs import small_config
+from tests.training.runs import same_state, small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError, SceneError
 from xplanes.experiment import Experiment
@@ -159,9 +159,7 @@ def test_a_resumed_fit_ends_with_the_same_numbers(config, tmp_path):
         return module.state_dict()
 
     whole, resumed = fit(None, SaveAt(13, path)), fit(path)
-    assert whole.keys() == resumed.keys()
-    for name, value in whole.items():
-        assert torch.equal(resumed[name], value), name
+    same_state(whole, resumed)
 
 
 def test_callbacks_that_watch_a_metric_see_every_evaluation(scenes, tmp_path):
@@ -259,7 +257,7 @@ def test_an_average_of_weights_is_scored_and_kept(config, tmp_path):
     """Without buffers: an averaged grid would never empty."""
     average = EMAWeightAveraging(decay=0.9, use_buffers=False)
     keep = ModelCheckpoint(tmp_path, filename="mean", save_on_exception=False)
-    used = trainer(tmp_path, max_steps=30, logger=False, callbacks=[average, keep])
+    used = trainer(tmp_path, max_steps=10, logger=False, callbacks=[average, keep])
     module, data = RadianceModule(config), SceneDataModule(config["data"])
     used.fit(module, data)
     stored = torch.load(keep.best_model_path, weights_only=True)
@@ -368,8 +366,7 @@ def test_the_page_on_your_own_trainer_runs(config, tmp_path, monkeypatch):
     assert names["trainer"].global_step == 12
     kept = torch.load(tmp_path / "checkpoints" / "best.ckpt", weights_only=True)
     assert {"current_model_state", "averaging_state"} <= kept.keys()
-    for name, value in kept["state_dict"].items():
-        assert torch.equal(names["again"].state_dict()[name], value), name
+    same_state(kept["state_dict"], names["again"].state_dict())
 
 
 def test_a_checkpoint_of_another_version_is_refused_with_its_number(fitted, tmp_path):

@@ -189,7 +189,9 @@ def test_fair_means_equal_rays_samples_and_terms():
     assert losses == {(0.0, 0.0)}
 
 
-@pytest.mark.parametrize("chosen", [["recipe=paper", "lrm=tiny"], []])
+@pytest.mark.parametrize(
+    "chosen", [pytest.param(["recipe=paper", "lrm=tiny"], marks=pytest.mark.slow), []]
+)
 def test_the_ablation_changes_one_thing_at_a_time(chosen):
     whole = changed((), *chosen)
     for overrides in jobs_of("sweep=ablation", "data.scene=excavator", "seed=0", *chosen):

@@ -133,7 +133,18 @@ def test_the_page_has_a_section_for_each_format():
     assert named == {"colmap", "nerfstudio", "blender", "nerfies", "llff", "multicamera"}
 
 
-@pytest.mark.parametrize("words", commands("xplanes inspect"), ids=" ".join)
+def each_capture(program: str) -> list[Any]:
+    """The page's commands of a program; further ones on the same capture are slow."""
+    found, seen = [], set()
+    for words in commands(program):
+        names = re.findall("dancer|statue|excavator|broom|fern|kitchen", " ".join(words))
+        again = pytest.mark.slow if set(names) <= seen else ()
+        found.append(pytest.param(words, marks=again, id=" ".join(words)))
+        seen |= set(names)
+    return found
+
+
+@pytest.mark.parametrize("words", each_capture("xplanes inspect"))
 def test_inspect_as_the_page_says(words, place, monkeypatch, capsys):
     monkeypatch.chdir(place)
     before = {path: path.stat().st_mtime_ns for path in (place / "captures").rglob("*")}
@@ -157,7 +168,7 @@ def small(words: list[str]) -> list[str]:
     return [*sizes, *kept, "lrm=none", "trainer.max_steps=2", "callbacks.evaluation.at=[0]"]
 
 
-@pytest.mark.parametrize("words", commands(r"python train\.py"), ids=" ".join)
+@pytest.mark.parametrize("words", each_capture(r"python train\.py"))
 def test_training_reads_what_the_page_says(words, place, monkeypatch):
     monkeypatch.chdir(place)
     settings = [text for text in small(words) if not text.startswith("hydra.")]

@@ -1,21 +1,19 @@
 """What every baseline's run must do."""
 
-import csv
-import json
 from pathlib import Path
 
 import pytest
-import torch
 
 from tests.baselines.runs import baseline_config
 from tests.refusals import assert_refused
+from tests.training.runs import broken_off, checkpoint, metrics, same_state
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
+from xplanes.files import read_rows
 from xplanes.run import run
 from xplanes.tools.evaluate import evaluate
 from xplanes.tools.render import VideoOptions, render_video
 from xplanes.tools.runs import TrainedRun, load_run
-from xplanes.training.clock import TrainingClock
 
 
 def check_refused(root: Path, words: str, *overrides: str) -> str:
@@ -27,13 +25,8 @@ def check_refused(root: Path, words: str, *overrides: str) -> str:
     return assert_refused(ConfigError, words, call, overrides)
 
 
-def metrics(folder: Path) -> dict:
-    return json.loads((folder / "metrics.json").read_text())
-
-
 def scores(folder: Path) -> list[float]:
-    with (folder / "curve.csv").open() as file:
-        return [float(row["psnr"]) for row in csv.DictReader(file)]
+    return [float(row["psnr"]) for row in read_rows(folder / "curve.csv")]
 
 
 def check_learns(config: dict, folder: Path, *, gain: float) -> Path:
@@ -48,29 +41,12 @@ def check_learns(config: dict, folder: Path, *, gain: float) -> Path:
     return folder
 
 
-def check_resume(
-    config: dict, whole: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, *, stop: int
-) -> None:
+def check_resume(config: dict, whole: Path, folder: Path, *, stop: int) -> None:
     """A run that failed and was resumed is bit-identical to an uninterrupted one."""
-    original = TrainingClock.on_train_batch_end
-
-    def break_down(self, trainer, module, *rest) -> None:
-        original(self, trainer, module, *rest)
-        if trainer.global_step == stop:
-            raise OSError("power cut")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(TrainingClock, "on_train_batch_end", break_down)
-        with pytest.raises(OSError, match="power cut"):
-            run(config, folder, [], resume=False)
+    broken_off((stop,), config, folder)
     run(config, folder, [], resume=True)
     assert scores(folder) == scores(whole)
-    first, second = (
-        torch.load(path / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
-        for path in (whole, folder)
-    )
-    assert set(first) == set(second)
-    assert all(torch.equal(first[key], second[key]) for key in first)
+    same_state(*(checkpoint(path)["state_dict"] for path in (whole, folder)))
 
 
 def check_reload(folder: Path) -> TrainedRun:

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from tests.baselines.checks import check_reload, check_resume, metrics, scores
+from tests.baselines.checks import check_reload, check_resume, scores
 from tests.baselines.runs import baseline_config
+from tests.training.runs import metrics
 from xplanes.run import run
 
 SMALL = (
@@ -29,7 +30,7 @@ MODELS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
-def test_run_learns_grows_resumes_and_is_loaded(scenes, tmp_path, monkeypatch, name):
+def test_run_learns_grows_resumes_and_is_loaded(scenes, tmp_path, name):
     cache = f"preparation.cache={tmp_path}/cache"
     config = baseline_config(scenes, f"model={name}", *SMALL, *MODELS[name], cache)
     folder = tmp_path / "whole"
@@ -39,7 +40,7 @@ def test_run_learns_grows_resumes_and_is_loaded(scenes, tmp_path, monkeypatch, n
     assert metrics(folder)["steps_skipped"] == 0
     # Between two rounds of densification, in the second stage: rows, moments and statistics of
     # another number than the first are loaded.
-    check_resume(config, folder, tmp_path / "broken", monkeypatch, stop=27)
+    check_resume(config, folder, tmp_path / "broken", stop=27)
     field = check_reload(folder).module.field
     assert len(field) != 200
     assert field.deforms

@@ -19,10 +19,10 @@ FAST = (*KPLANES, "model.channels=8", "model.learning_rate=0.03")
 
 
 @pytest.mark.slow
-def test_hybrid_run_learns_resumes_and_is_loaded(scenes, tmp_path, monkeypatch):
+def test_hybrid_run_learns_resumes_and_is_loaded(scenes, tmp_path):
     config = baseline_config(scenes, "model=kplanes", *FAST, *PROPOSAL, "trainer.max_steps=36")
     folder = check_learns(config, tmp_path / "whole", gain=3)
-    check_resume(config, folder, tmp_path / "broken", monkeypatch, stop=23)
+    check_resume(config, folder, tmp_path / "broken", stop=23)
     trained = check_reload(folder)
     assert set(trained.module.state_dict()) >= {"proposals.0.products.scales.0.xy"}
 

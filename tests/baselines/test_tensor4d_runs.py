@@ -14,12 +14,12 @@ from xplanes.streams import TrainingState
 
 
 @pytest.mark.slow
-def test_surface_run_learns_resumes_and_is_loaded(scenes, tmp_path, monkeypatch):
+def test_surface_run_learns_resumes_and_is_loaded(scenes, tmp_path):
     schedule = ("model.fine_from=6", "model.blur_until=15", "trainer.max_steps=20")
     config = baseline_config(scenes, "model=tensor4d", *TENSOR4D, *NEUS, *schedule)
     whole = check_learns(config, tmp_path / "whole", gain=1.5)
     # When it stops the fine level has joined, and planes are still averaged down.
-    check_resume(config, whole, tmp_path / "broken", monkeypatch, stop=13)
+    check_resume(config, whole, tmp_path / "broken", stop=13)
     trained = check_reload(whole)
     assert bool(trained.module.field.canonical_planes.fine)
     assert not bool(trained.module.field.canonical_planes.blurred)

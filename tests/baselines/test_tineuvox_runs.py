@@ -14,11 +14,11 @@ FAST = ("model.network_learning_rate=0.004", "trainer.max_steps=34")
 
 
 @pytest.mark.slow
-def test_run_learns_grows_resumes_and_is_loaded(scenes, tmp_path, monkeypatch):
+def test_run_learns_grows_resumes_and_is_loaded(scenes, tmp_path):
     config = baseline_config(scenes, "model=tineuvox_s", *TINEUVOX, *FAST)
     folder = check_learns(config, tmp_path / "whole", gain=3)
     # Between two growths, so that the grid and the moments of another size are loaded.
-    check_resume(config, folder, tmp_path / "broken", monkeypatch, stop=23)
+    check_resume(config, folder, tmp_path / "broken", stop=23)
     trained = check_reload(folder)
     assert int(trained.module.field.voxels) == 20**3
 

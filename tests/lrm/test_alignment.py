@@ -131,7 +131,7 @@ def test_published_normalisation_of_poses_is_a_special_case():
             compare(transformed(alignment.frame, pose)[:3], expected, atol=2e-6, case=kind)
 
 
-SIZE = 9
+SIZE = 7
 
 
 def source_rays(view, seed=5, depth=4.03):

@@ -6,6 +6,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+OPTIONS = {
+    **{"width": 12, "hidden": 1, "activation": "silu"},
+    **{"density": "exp", "density_scale": 2.0, "colour_margin": 0.0},
+}
+"""Options of a small decoder."""
+
 AXES = ((0, 1), (0, 2), (1, 2))
 """Axes along columns and rows of the planes xy, xz, yz."""
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.balls import ball_scene
-from tests.preparation.sequences import blob, moving_sequence, static_features
+from tests.preparation.sequences import OPTIONS, blob, moving_sequence, static_features
 from tests.refusals import assert_refused
 from tests.training.runs import small_config
 from xplanes import run
@@ -25,14 +25,6 @@ from xplanes.scenes.frame import Frame, cube_frame
 from xplanes.training.module import RadianceModule
 
 FRAME = cube_frame(1.5, torch.zeros(3))
-OPTIONS = {
-    "width": 12,
-    "hidden": 1,
-    "activation": "silu",
-    "density": "exp",
-    "density_scale": 2.0,
-    "colour_margin": 0.0,
-}
 
 
 def settings(folder: Path, *overrides: str) -> Method:

@@ -8,21 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.preparation.sequences import moving_sequence
+from tests.preparation.sequences import OPTIONS, moving_sequence
 from tests.refusals import assert_refused
 from xplanes.errors import ConfigError, SceneError
 from xplanes.fields import Decoder
 from xplanes.preparation import TriplaneSequence, load_triplanes, save_triplanes
 from xplanes.scenes.frame import Frame
 
-OPTIONS = {
-    "width": 12,
-    "hidden": 1,
-    "activation": "silu",
-    "density": "exp",
-    "density_scale": 2.0,
-    "colour_margin": 0.0,
-}
 ROTATION = torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 
 

@@ -73,6 +73,7 @@ def test_exposures_are_matched_where_images_show_surroundings(kind, overrides, m
     assert ("exposures.logarithms" in module.state_dict()) == matched
 
 
+@pytest.mark.slow
 def test_photos_of_different_exposure_are_told_apart(monkeypatch, tmp_path):
     monkeypatch.setattr(building, "EXPOSURE_START", 20)
     given, dark = scene("world"), torch.arange(12) % 2 == 0

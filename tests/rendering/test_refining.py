@@ -8,7 +8,7 @@ from lightning import Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from tests.balls import RAYS, ball_scene, surrounding
-from tests.training.runs import checkpoint, metrics, small_config
+from tests.training.runs import checkpoint, metrics, same_state, small_config
 from xplanes import RadianceModule
 from xplanes.errors import ConfigError
 from xplanes.rendering import refining
@@ -233,10 +233,8 @@ def test_a_run_refines_its_cameras(soon, scenes, tmp_path):
     assert 0 < found["mean_px"] <= found["most_px"]
     assert found["farthest"] in found["camera_to_world"]
     assert "cameras  moved by" in (folder / "train.log").read_text()
-    state = checkpoint(folder)["state_dict"]
     loaded = RadianceModule.load_from_checkpoint(folder / "checkpoints" / "last.ckpt")
-    for name, value in loaded.state_dict().items():
-        assert torch.equal(value, state[name]), name
+    same_state(loaded.state_dict(), checkpoint(folder)["state_dict"])
     exact = small_config(scenes, *few, "data.refine_cameras=false", "trainer.max_steps=12")
     with pytest.raises(ConfigError, match=r"trained with data\.refine_cameras=True"):
         run(exact, folder, [], resume=True)
@@ -256,8 +254,7 @@ def test_refinement_goes_on_exactly(soon, scenes, tmp_path):
         trainer.fit(module, SceneDataModule.of(scene), ckpt_path=path)
         found.append(module.state_dict())
     assert found[0]["cameras.motion"].abs().max() > 0
-    for name, value in found[0].items():
-        assert torch.equal(value, found[1][name]), name
+    same_state(*found)
 
 
 def test_a_scene_in_python_says_whether_its_cameras_are_refined():

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from xplanes.config import compose_plain
+from tests.training.runs import changed
 from xplanes.rendering import front_to_back
 from xplanes.rendering.grid_renderer import (
     DIAGONAL,
@@ -25,6 +25,12 @@ WHITE = torch.ones(3, dtype=torch.float64)
 
 def renderer_of(samples=64, resolution=4, **options):
     return GridRenderer(OccupancyGrid(resolution, 1, step=DIAGONAL / samples), samples, **options)
+
+
+def settings_of(**changes):
+    known = changed(())["model"]["sampler"]
+    del known["_target_"]
+    return OccupancySettings(**known | changes)
 
 
 def fog(density):
@@ -219,9 +225,7 @@ class Fog(torch.nn.Module):
 
 def test_random_points_of_occupied_cells_pay_for_their_opacity():
     renderer = renderer_of(64, 6)
-    options = compose_plain("train", [])["model"]["sampler"]
-    known = {key: value for key, value in options.items() if key != "_target_"}
-    settings = OccupancySettings(**known | {"sparsity": 0.5, "update_every": 4})
+    settings = settings_of(sparsity=0.5, update_every=4)
     sampler, field = OccupancySampler(renderer, settings), Fog(0.7)
     sampler.regularise(field, TrainingState(0, 3, 3, 0))
     assert field.density.grad is None
@@ -237,9 +241,7 @@ def test_random_points_of_occupied_cells_pay_for_their_opacity():
 
 
 def test_fog_before_a_background_pays_for_its_distortion():
-    options = compose_plain("train", [])["model"]["sampler"]
-    known = {key: value for key, value in options.items() if key != "_target_"}
-    settings = OccupancySettings(**known | {"distortion": 0.5, "coarse_first": False})
+    settings = settings_of(distortion=0.5, coarse_first=False)
     batch = dict(zip(("origins", "directions", "times"), rays_of(8), strict=True))
     batch |= {"background": WHITE.expand(8, 3), "jitter": batch["times"]}
     state = TrainingState(0, 1, 1, 0)
@@ -284,7 +286,5 @@ def test_points_of_occupied_cells_lie_in_all_of_them_and_in_no_others():
     ],
 )
 def test_bins_along_time_follow_timesteps_that_several_views_show(views, timesteps, given, bins):
-    known = compose_plain("train", [])["model"]["sampler"]
-    known = {name: value for name, value in known.items() if name != "_target_"}
-    settings = OccupancySettings(**known | {"time_bins": given})
-    assert settings.bins(torch.linspace(0, 1, timesteps).repeat(views // timesteps)) == bins
+    times = torch.linspace(0, 1, timesteps).repeat(views // timesteps)
+    assert settings_of(time_bins=given).bins(times) == bins

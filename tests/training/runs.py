@@ -3,18 +3,23 @@
 import copy
 import functools
 import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import hydra
+import pytest
 import torch
 from hydra import initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 
 from xplanes.config import CONF, to_plain
+from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Scene
+from xplanes.training.clock import TrainingClock
 from xplanes.training.fit import Trainer
 from xplanes.training.module import RadianceModule
 
@@ -109,3 +114,38 @@ def status(folder: Path) -> dict[str, Any]:
 def checkpoint(folder: Path, name: str = "last") -> dict[str, Any]:
     """A checkpoint of a run."""
     return torch.load(folder / "checkpoints" / f"{name}.ckpt", weights_only=True)
+
+
+def same_state(first: Mapping[str, Tensor], second: Mapping[str, Tensor]) -> None:
+    """Both have the same names and the same bits."""
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        assert torch.equal(value, second[name]), name
+
+
+def after_each_batch(
+    patch: pytest.MonkeyPatch, do: Callable[[TrainingClock, Any, RadianceModule], None]
+) -> None:
+    """Do something at the end of each batch, once the clock has seen it."""
+    original = TrainingClock.on_train_batch_end
+
+    def see(self: TrainingClock, trainer: Any, module: Any, *rest: Any) -> None:
+        original(self, trainer, module, *rest)
+        do(self, trainer, module)
+
+    patch.setattr(TrainingClock, "on_train_batch_end", see)
+
+
+def broken_off(steps: tuple[int, ...], config: dict[str, Any], folder: Path) -> None:
+    """A run that fails after each of these steps, and is resumed each time."""
+    for stop in steps:
+
+        def break_down(_: TrainingClock, trainer: Any, __: Any, stop: int = stop) -> None:
+            if trainer.global_step == stop:
+                raise OSError("power cut")
+
+        with pytest.MonkeyPatch.context() as patch:
+            after_each_batch(patch, break_down)
+            with pytest.raises(OSError, match="power cut"):
+                run(config, folder, [], resume=stop != steps[0])
+        assert status(folder)["status"] == "failed"

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from tests.balls import ball_views, swinging
-from tests.training.runs import small_config
-from xplanes.config import compose_plain
+from tests.training.runs import changed, checkpoint, same_state, small_config
 from xplanes.models import x_planes
 from xplanes.models.initialisation import Method
 from xplanes.run import run
@@ -44,11 +43,7 @@ def test_planes_do_not_follow_pixels_where_things_move_before_surroundings():
 def test_they_may_be_given_or_left_out():
     assert settings("model.fine.texels=100").fine_texels(0) == 100
     assert settings("model.fine=null").fine_texels(4000) == 0
-    assert compose_plain("train", ["recipe=paper"])["model"]["fine"] is None
-
-
-def state_of(folder: Path) -> dict:
-    return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    assert changed(("recipe=paper",))["model"]["fine"] is None
 
 
 def test_they_are_zero_until_their_first_step_and_go_on_exactly(scenes, tmp_path):
@@ -57,13 +52,12 @@ def test_they_are_zero_until_their_first_step_and_go_on_exactly(scenes, tmp_path
         # A limit in steps is no schedule: the rates depend on the share of it that is done.
         config = small_config(scenes, *FINE, "model.final_lr=1.0", f"trainer.max_steps={steps}")
         run(config, parts, [], resume=steps > 8)
-        fine = state_of(parts)["state_dict"]["field.fine"]
+        fine = checkpoint(parts)["state_dict"]["field.fine"]
         assert fine.shape == (3, 40, 40, 3)
         assert bool(fine.any()) == (steps > 8)
     run(config, whole, [], resume=False)
-    first, second = state_of(whole), state_of(parts)
-    for name, value in first["state_dict"].items():
-        assert torch.equal(value, second["state_dict"][name]), name
+    first, second = checkpoint(whole), checkpoint(parts)
+    same_state(first["state_dict"], second["state_dict"])
     groups = first["optimizer_states"][0]["param_groups"]
     assert [group["name"] for group in groups] == ["space", "time", "fine", "decoder"]
 

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from tests.balls import ball_scene
-from tests.training.runs import composed, metrics, small_config
-from xplanes.config import compose_plain
+from tests.training.runs import changed, composed, metrics, small_config
 from xplanes.files import read_rows
 from xplanes.lrm.bundled import bundled_models
 from xplanes.models.initialisation import Initialisation, Method, Place
@@ -67,7 +66,7 @@ def test_without_a_video_only_an_lrm_that_is_asked_for_sees_a_scene(
     if masked:
         scene = replace(scene, lrm_views=scene.splits["train"])
     place = Place(scene, scene_frame(scene.splits["train"]), torch.device("cpu"))
-    method = Method.read(compose_plain("train", overrides))
+    method = Method.read(changed((), *overrides))
     initial = method.lrm.load().initialise(method, place)
     assert (initial is found) == used
     if not used:

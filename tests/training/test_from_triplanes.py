@@ -6,8 +6,8 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.preparation.sequences import moving_sequence
-from tests.training.runs import checkpoint, metrics, small_config
+from tests.preparation.sequences import OPTIONS, moving_sequence
+from tests.training.runs import broken_off, checkpoint, metrics, same_state, small_config
 from xplanes.decomposition import decompose, unexplained_energy
 from xplanes.decomposition.conversion import frame_profiles
 from xplanes.errors import ConfigError
@@ -23,17 +23,7 @@ from xplanes.scenes.frame import Frame
 from xplanes.streams import TrainingState
 from xplanes.tools.evaluate import evaluate
 from xplanes.tools.runs import load_run
-from xplanes.training.clock import TrainingClock
 from xplanes.training.module import RadianceModule
-
-OPTIONS = {
-    "width": 16,
-    "hidden": 1,
-    "activation": "silu",
-    "density": "exp",
-    "density_scale": 20.0,
-    "colour_margin": 0.0,
-}
 
 
 @pytest.fixture(scope="module")
@@ -138,19 +128,8 @@ def test_the_sparse_part_is_in_no_checkpoint(trained, place):
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one(trained, place, tmp_path, monkeypatch):
-    config, whole = settings(place), trained
-    original = TrainingClock.on_train_batch_end
-
-    def break_down(self, trainer, module, *rest) -> None:
-        original(self, trainer, module, *rest)
-        if trainer.global_step == 13:
-            raise OSError("power cut")
-
-    folder = tmp_path / "broken"
-    monkeypatch.setattr(TrainingClock, "on_train_batch_end", break_down)
-    with pytest.raises(OSError, match="power cut"):
-        run(config, folder, [], resume=False)
-    monkeypatch.undo()
+    config, whole, folder = settings(place), trained, tmp_path / "broken"
+    broken_off((13,), config, folder)
 
     def refuse(*_args, **_options):
         raise AssertionError("decomposed again")
@@ -158,9 +137,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(trained, place, tmp_path, mon
     # The parts come from the cache.
     monkeypatch.setattr(stages_module, "decompose", refuse)
     run(config, folder, [], resume=True)
-    ours, theirs = weights(folder), weights(whole)
-    assert set(ours) == set(theirs)
-    assert all(torch.equal(ours[key], theirs[key]) for key in ours)
+    same_state(weights(folder), weights(whole))
     for key in ("test", "views", "step", "skipped", "samples_per_ray", "decomposition"):
         assert metrics(folder)[key] == metrics(whole)[key]
 
@@ -191,6 +168,11 @@ def built(config: dict) -> XPlanesModel:
     return module.model
 
 
+def planes_of(model: XPlanesModel) -> tuple[torch.nn.Parameter, torch.nn.Parameter]:
+    assert model.field.time is not None
+    return model.field.space, model.field.time
+
+
 def test_regularisers_towards_the_initialisation_fade(place):
     """Without other terms, a gradient is what it would be without fading times what is left."""
     quiet = [
@@ -200,24 +182,25 @@ def test_regularisers_towards_the_initialisation_fade(place):
         "model.loss.time_magnitude=0",
     ]
 
-    def gradients(step: int, fading: str) -> list[torch.Tensor]:
+    def moved(fading: str) -> XPlanesModel:
         steps = f"model.loss.initial_steps={fading}"
         model = built(settings(place, *quiet, steps, "data.views=3"))
-        field = model.field
-        assert field.time is not None
         with torch.no_grad():
-            field.space.add_(1.0)
-            field.time.add_(1.0)
-        for plane in (field.space, field.time):
+            for plane in planes_of(model):
+                plane.add_(1.0)
+        return model
+
+    def gradients(model: XPlanesModel, step: int) -> list[torch.Tensor]:
+        for plane in planes_of(model):
             plane.grad = torch.zeros_like(plane)
         model.regularise(TrainingState(seed=step, step=step, batch=step, rank=0))
-        return [plane.grad for plane in (field.space, field.time) if plane.grad is not None]
+        return [plane.grad for plane in planes_of(model) if plane.grad is not None]
 
-    whole, left = gradients(24, "null"), gradients(24, "288")
+    whole, fading = gradients(moved("null"), 24), moved("288")
     assert all(float(gradient.abs().max()) > 0 for gradient in whole)
-    for gradient, all_of_it in zip(left, whole, strict=True):
+    for gradient, all_of_it in zip(gradients(fading, 24), whole, strict=True):
         torch.testing.assert_close(gradient, 0.75 * all_of_it)
-    assert not any(gradient.any() for gradient in gradients(96, "288") + gradients(104, "288"))
+    assert not any(gradient.any() for step in (96, 104) for gradient in gradients(fading, step))
 
 
 def test_a_field_that_starts_again_keeps_l_r_while_it_is_of_use(place):
@@ -238,12 +221,11 @@ def test_total_variation_has_a_weight_for_the_planes_of_space_and_one_for_those_
     off += ["model.loss.initial_weight=0", "model.loss.sparse_weight=0", "model.loss.every=1"]
     weigh = [f"model.loss.{name}={weight}" for name, weight in weights.items()]
     model = built(settings(place, *off, *weigh))
-    field, state = model.field, TrainingState(seed=0, step=1, batch=1, rank=0)
-    assert field.time is not None
+    state = TrainingState(seed=0, step=1, batch=1, rank=0)
     with torch.no_grad():
-        for plane in (field.space, field.time):
+        for plane in planes_of(model):
             plane.add_(torch.randn(plane.shape, generator=torch.Generator().manual_seed(5)))
-    space, time = (p.detach().double().requires_grad_() for p in (field.space, field.time))
+    space, time = (p.detach().double().requires_grad_() for p in planes_of(model))
     columns, rows = space[:, :, 1:] - space[:, :, :-1], space[:, 1:] - space[:, :-1]
     along = time[:, :, 1:] - time[:, :, :-1]
     expected = {
@@ -254,10 +236,10 @@ def test_total_variation_has_a_weight_for_the_planes_of_space_and_one_for_those_
     assert model.regularisers(state) == pytest.approx(values, rel=1e-5)
 
     torch.stack(list(expected.values())).sum().backward()
-    for plane in (field.space, field.time):
+    for plane in planes_of(model):
         plane.grad = torch.zeros_like(plane)
     model.regularise(state)
-    for plane, exact in ((field.space, space), (field.time, time)):
+    for plane, exact in zip(planes_of(model), (space, time), strict=True):
         assert plane.grad is not None
         assert exact.grad is not None
         torch.testing.assert_close(plane.grad.double(), exact.grad, rtol=1e-4, atol=1e-9)
@@ -273,6 +255,7 @@ def test_the_regulariser_scales_with_the_inverse_square_of_the_views(place):
     assert hold("none", 2) == 0.0
 
 
+@pytest.mark.slow
 def test_l_r_moves_random_planes_towards_the_sparse_part(place, tmp_path):
     """Colours are taken out of the loss as far as they go, so that L_r alone is seen."""
     left = {}

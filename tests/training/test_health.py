@@ -4,15 +4,24 @@ import math
 import re
 import shutil
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import pytest
 import torch
 from torch import nn
 
-from tests.training.runs import checkpoint, metrics, small_config, status
+from tests.refusals import assert_refused
+from tests.training.runs import (
+    after_each_batch,
+    checkpoint,
+    metrics,
+    same_state,
+    small_config,
+    status,
+)
 from xplanes.errors import ConfigError
 from xplanes.files import read_rows
 from xplanes.models.base import LossTerm
@@ -21,7 +30,6 @@ from xplanes.optional import MissingExtraError
 from xplanes.run import run
 from xplanes.training import building, module
 from xplanes.training.checkpoints import find_resumable, load_checkpoint
-from xplanes.training.clock import TrainingClock
 from xplanes.training.diagnosis import (
     TrainingError,
     broken_flag,
@@ -29,13 +37,15 @@ from xplanes.training.diagnosis import (
     unusable_gradients,
     usable,
 )
+from xplanes.training.losses import loss_terms
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import claim, keeping_settings
 
-LONG = ("trainer.max_steps=40", "callbacks.checkpoints.every=5", "callbacks.evaluation.at=[]")
+UNSCORED = ("callbacks.checkpoints.every=5", "callbacks.evaluation.at=[]", "data.eval_views=1")
+LONG = ("trainer.max_steps=40", *UNSCORED)
 """More steps than may be left out in a row."""
 
-FEW = ("trainer.max_steps=12", "callbacks.checkpoints.every=5", "callbacks.evaluation.at=[]")
+FEW = ("trainer.max_steps=12", *UNSCORED)
 SCORED = (*FEW, "callbacks.evaluation.at=[0.4]")
 
 
@@ -77,6 +87,12 @@ def spoil_gradient(monkeypatch: pytest.MonkeyPatch, value: float, steps: range) 
     monkeypatch.setattr(XPlanesModel, "regularise", spoil)
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few steps in a row that are left out end training."""
+    monkeypatch.setattr(module, "PATIENCE", 3)
+
+
 def test_one_bad_gradient_costs_one_step(scenes, tmp_path, monkeypatch):
     spoil_gradient(monkeypatch, 1e25, range(3, 4))
     run(small_config(scenes, *FEW, "trainer.max_steps=6"), tmp_path, [], resume=False)
@@ -96,7 +112,7 @@ def test_gradients_that_stay_bad_end_training_with_a_message(scenes, tmp_path, m
     assert {float(each["step"]) for each in kept["optimizer_states"][0]["state"].values()} == {7}
 
 
-def test_gradients_that_are_bad_from_the_first_step_on(scenes, tmp_path, monkeypatch):
+def test_gradients_that_are_bad_from_the_first_step_on(scenes, tmp_path, monkeypatch, impatient):
     spoil_gradient(monkeypatch, 1e30, range(1000))
     words = r"step 0 on.*gradient of field\.space.*check the values and gradients of XPlanes"
     with pytest.raises(TrainingError, match=words):
@@ -148,15 +164,13 @@ class Shaped(LossTerm):
         return forms[self.form]
 
 
-def with_loss(scenes: Path, **settings) -> dict:
-    config = small_config(scenes, *LONG)
-    name = "Spoiled" if "first" in settings else "Shaped"
-    term = {"_target_": f"{__name__}.{name}", "weight": 1.0, **settings}
-    return config | {"losses": {"mine": term}, "plugins": [__name__]}
+def with_loss(scenes: Path, first: int) -> dict:
+    term = {"_target_": f"{__name__}.Spoiled", "weight": 1.0, "first": first}
+    return small_config(scenes, *LONG) | {"losses": {"mine": term}, "plugins": [__name__]}
 
 
 @pytest.mark.parametrize(("first", "more"), [(0, r"omit it$"), (7, r"omit it; resume=")])
-def test_an_added_loss_that_is_not_finite_is_named(scenes, tmp_path, first, more):
+def test_an_added_loss_that_is_not_finite_is_named(scenes, tmp_path, impatient, first, more):
     said = refused(with_loss(scenes, first=first), tmp_path / "run")
     assert re.search(
         rf"the loss was nan.*from step {first} on; not finite: losses\.mine; largest", said
@@ -165,30 +179,33 @@ def test_an_added_loss_that_is_not_finite_is_named(scenes, tmp_path, first, more
     assert "initialisation" not in said
 
 
-def test_a_term_of_the_loss_must_be_one_number(scenes, tmp_path, monkeypatch):
+def terms_with(name: str, form: str, own: Any = 0.0) -> dict[str, torch.Tensor]:
+    """The terms of a loss: one of a model's own, and another of this name."""
+    model = Mock(losses=lambda *_: {"own": own})
+    parts = Mock(model=model, sampler=Mock(losses=lambda _: {}))
+    rendering = Mock(opacity=torch.tensor([0.25, 0.75]), colour=torch.zeros(2, 3))
+    return loss_terms(parts, {name: Shaped(weight=2.0, form=form)}, rendering, {}, Mock())
+
+
+def test_a_term_of_the_loss_is_one_number_and_takes_no_other_ones_place():
     for form in ("one", "number"):
-        config = with_loss(scenes, form=form)
-        config["trainer"]["max_steps"] = 2
-        run(config, tmp_path / form, [], resume=False)
-    said = refused(with_loss(scenes, form="rays"), tmp_path / "rays")
-    words = r"losses\.mine: returned a tensor of shape \[\d+\]; return one number, such as its mean"
-    assert re.fullmatch(words, said)
-    said = refused(with_loss(scenes, form="list"), tmp_path / "list")
-    assert said.startswith("losses.mine: returned list; ")
-    monkeypatch.setattr(XPlanesModel, "losses", lambda *_: {"own": torch.ones(3)})
-    said = refused(small_config(scenes, *FEW), tmp_path / "own")
-    assert said.startswith("loss term own: returned a tensor of shape [3]; ")
-
-
-def test_a_term_of_the_loss_takes_no_other_ones_place(scenes, tmp_path):
-    config = with_loss(scenes, form="one")
-    config["losses"] = {"colour": config["losses"]["mine"]}
-    with pytest.raises(ConfigError, match=r"^losses\.colour: the loss has a term of this name"):
-        run(config, tmp_path / "run", [], resume=False)
+        found = terms_with("mine", form)
+        assert found == {"own": 0.0, "mine": 1.0}
+        assert {term.shape for term in found.values()} == {()}
+    words = "returned a tensor of shape [2]; return one number, such as its mean"
+    for form, own, said in (
+        ("rays", 0.0, f"losses.mine: {words}"),
+        ("list", 0.0, "losses.mine: returned list; "),
+        ("one", torch.ones(2), f"loss term own: {words}"),
+    ):
+        call = partial(terms_with, "mine", form, own)
+        assert_refused(TrainingError, f"^{re.escape(said)}", call, form)
+    with pytest.raises(ConfigError, match=r"^losses\.own: the loss has a term of this name"):
+        terms_with("own", "one")
 
 
 def test_the_initialisation_is_blamed_if_there_was_one_and_it_renders_nothing_finite(
-    scenes, tmp_path, monkeypatch
+    scenes, tmp_path, monkeypatch, impatient
 ):
     for initialised, words in (
         (True, "initialisation is to blame.*set lrm=none"),
@@ -208,15 +225,12 @@ def refused(config: dict, folder: Path) -> str:
 
 
 def test_a_checkpoint_never_holds_what_is_not_finite(scenes, tmp_path, monkeypatch):
-    original = TrainingClock.on_train_batch_end
-
-    def spoil(self, trainer, module, *rest) -> None:
-        original(self, trainer, module, *rest)
+    def spoil(_, trainer, module) -> None:
         if trainer.global_step == 10:
             with torch.no_grad():
                 module.field.decoder.layers[0].bias[0] = math.inf
 
-    monkeypatch.setattr(TrainingClock, "on_train_batch_end", spoil)
+    after_each_batch(monkeypatch, spoil)
     with pytest.raises(TrainingError, match=r"step 10: field\.decoder\.layers\.0\.bias"):
         run(small_config(scenes, *FEW), tmp_path / "spoiled", [], resume=False)
     assert checkpoint(tmp_path / "spoiled")["global_step"] == 5
@@ -265,15 +279,18 @@ def flipped(content: bytes) -> bytes:
     return content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :]
 
 
-@pytest.mark.parametrize("damage", [shortened, flipped])
-def test_a_damaged_checkpoint_gives_way_to_the_best(scenes, whole, folder, caplog, damage):
-    last = folder / "checkpoints" / "last.ckpt"
-    last.write_bytes(damage(last.read_bytes()))
+def test_a_damaged_checkpoint_gives_way_to_the_best(scenes, whole, folder, caplog):
+    last, best = (folder / "checkpoints" / f"{name}.ckpt" for name in ("last", "best"))
+    content = last.read_bytes()
+    last.write_bytes(shortened(content))
+    assert find_resumable(last.parent) == last
+    assert last.read_bytes() == best.read_bytes() != content
+    last.write_bytes(flipped(content))
+    caplog.clear()
     run(small_config(scenes, *SCORED), folder, [], resume=True)
     assert "last.ckpt cannot be read" in caplog.text
     assert "Continuing from" in caplog.text
-    for name, value in checkpoint(whole)["state_dict"].items():
-        assert torch.equal(value, checkpoint(folder)["state_dict"][name]), name
+    same_state(checkpoint(whole)["state_dict"], checkpoint(folder)["state_dict"])
 
 
 def test_damaged_checkpoints_alone_are_refused_with_a_message(tmp_path):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.training.runs import checkpoint, small_config
+from tests.training.runs import checkpoint, same_state, small_config
 from xplanes.run import run
 from xplanes.scenes import importance
 from xplanes.training import module
@@ -38,8 +38,7 @@ def test_rays_are_weighted_from_its_first_batch_on_and_a_resumed_run_draws_the_s
     assert soon == [(batch, batch >= 3) for batch in range(11)]
     run(config, tmp_path / "whole", [], resume=False)
     parts, whole = checkpoint(tmp_path / "parts"), checkpoint(tmp_path / "whole")
-    for name, value in whole["state_dict"].items():
-        assert torch.equal(value, parts["state_dict"][name]), name
+    same_state(whole["state_dict"], parts["state_dict"])
     assert torch.equal(whole["error_map"]["sums"], parts["error_map"]["sums"])
     assert whole["error_map"]["sums"][:, 1].sum() > 0
 

@@ -14,16 +14,16 @@ from xplanes.streams import step_generator
 FRAMES = 5
 
 
-def case(plane_set="six", count=2):
+def case(plane_set="six", count=2, **options):
     generator = torch.Generator().manual_seed(0)
     planes = torch.randn(3 if plane_set == "six" else 6, 4, 6, 2, generator=generator)
     sparse = blob(FRAMES, 2, 6)
-    return SparseProduct(sparse, PLANE_SETS[plane_set], count), planes, sparse
+    return SparseProduct(sparse, PLANE_SETS[plane_set], count, **options), planes, sparse
 
 
-@pytest.mark.parametrize("plane_set", ["six", "nine"])
-def test_the_mean_over_steps_is_the_gradient_over_all_frames(plane_set):
-    product, planes, sparse = case(plane_set)
+@pytest.mark.parametrize(("plane_set", "reduction"), [("six", "mean"), ("nine", "sum")])
+def test_the_mean_over_steps_is_the_gradient_over_all_frames(plane_set, reduction):
+    product, planes, sparse = case(plane_set, reduction=reduction)
     leaf = planes.clone().requires_grad_()
     rows = PLANE_SETS[plane_set]
     sparse_product_loss(leaf, sparse, torch.arange(FRAMES), rows=rows).backward()
@@ -31,7 +31,10 @@ def test_the_mean_over_steps_is_the_gradient_over_all_frames(plane_set):
     steps = 2000
     for step in range(steps):
         product.add_gradient(total, planes, 0.5, step_generator(0, step, 7))
-    assert (total / steps - 0.5 * leaf.grad).norm() < 0.05 * leaf.grad.norm()
+    expected = 0.5 * leaf.grad * (sparse.numel() if reduction == "sum" else 1)
+    assert (total / steps - expected).norm() < 0.05 * expected.norm()
+    with pytest.raises(ValueError, match="reduction is 'total': allowed are mean, sum"):
+        case(reduction="total")
 
 
 @pytest.mark.parametrize("plane_set", ["six", "nine"])

@@ -10,7 +10,7 @@ import torch
 
 from tests.balls import ball_views, swinging
 from tests.baselines.runs import KPLANES, PROPOSAL, TINEUVOX
-from tests.training.runs import small_config, train_quietly
+from tests.training.runs import same_state, small_config, train_quietly
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.baselines.proposal import spaced, unspaced
 from xplanes.rendering.behind import background_colour
@@ -77,9 +77,7 @@ def test_a_plain_background_stays_as_it_was(kind):
     with_, without = built(kind), built(kind, "model.background=null")
     assert not scene(kind).is_surrounded
     assert with_.field.background is None
-    assert with_.state_dict().keys() == without.state_dict().keys()
-    for name, value in with_.state_dict().items():
-        assert torch.equal(value, without.state_dict()[name]), name
+    same_state(with_.state_dict(), without.state_dict())
     assert [group["name"] for group in with_.model.groups()] == ["space", "time", "decoder"]
     assert "opacity" in terms(with_, kind)
 

@@ -37,6 +37,9 @@ ELSEWHERE = {
 }
 """Settings by their names in other programs or earlier versions; {} stands for the value."""
 
+LAUNCHERS = ("joblib", "submitit_local", "submitit_slurm")
+"""Hydra's launchers that the extra ``sweep`` installs."""
+
 _PLAIN = re.compile(r"(?!\.\d)[A-Za-z_./][A-Za-z0-9_./-]*")
 """Text that Hydra reads verbatim; all other text needs quotes."""
 
@@ -214,6 +217,11 @@ def near_names(overrides: Sequence[str], name: str | None = "train") -> str:
                 values = list(each.sweep_string_iterator()) if swept else [each.value()]
                 for option in values:
                     if isinstance(option, str) and option not in options:
+                        if group == "hydra/launcher" and option in LAUNCHERS:
+                            return (
+                                f"{group}={option} is not installed: pip install "
+                                '"xplanes[sweep]"; in a checkout: pip install -e ".[sweep]"'
+                            )
                         named = {f"{group}={name}": name for name in options}
                         if group == "experiment":
                             sweeps = loader.get_group_options("sweep", config_name=name)

@@ -136,5 +136,7 @@ def _length(runs: int, trainers: Sequence[Mapping[str, Any]]) -> str:
         for key in ("max_seconds", "max_steps")
     )
     if trainers and len(seconds) == len(trainers):
-        return f"{runs} runs, at most {sum(seconds) / 60:.3g} minutes of training in all"
-    return f"{runs} runs, {sum(steps)} steps in all; the header of each says how long it takes"
+        budget = f"at most {sum(seconds) / 60:.3g} minutes of training"
+    else:
+        budget = f"{sum(steps)} steps"
+    return f"{runs} runs, {budget} in all; the header of each says how long it takes"

@@ -545,7 +545,7 @@ def write_planes(folder: Path, trained: TrainedRun) -> list[str]:
         ConfigError: If the run's field is not an `XPlanes`.
     """
     field, renderer, frame = trained.module.field, trained.module.renderer, trained.frame
-    if not isinstance(field, XPlanes):
+    if type(field) is not XPlanes:  # A derived field may have more than planes and a decoder.
         raise ConfigError(
             f"--what planes: {trained.experiment.method.model.name} has no planes in the layout of "
             "X-Planes; mesh and points work with every radiance field"

@@ -168,6 +168,10 @@ def _recognised(folder: Path, changed: Sequence[str]) -> tuple[Path, str]:
     if len(deeper) == 1:
         return _recognised(deeper[0], changed)
     inside = [path.name for path in deeper]
+    if (folder / "run.json").is_file():
+        raise SceneError(
+            f"{folder} is a run, not a scene: xplanes render, evaluate and view read it"
+        )
     scenes = f" Scenes inside it: {', '.join(inside)}." if inside else ""
     packed = sorted(path.name for path in folder.iterdir() if path.suffix in ARCHIVES)
     unpack = f" Unpack {some(packed)} first." if packed else ""

@@ -16,15 +16,18 @@ from hydra_plugins.xplanes import ALIASES
 from tests import inside
 from tests.training.runs import SMALL, metrics, small_config, status
 from tests.warm import forked
+from xplanes import config as config_module
 from xplanes.cli import main
-from xplanes.config import CONF, compose_plain
+from xplanes.config import CONF, compose_plain, near_names
 from xplanes.errors import ConfigError, SceneError
+from xplanes.evaluation import report
 from xplanes.evaluation.render import FRAMES
 from xplanes.evaluation.report import estimated
 from xplanes.launch import prepare
 from xplanes.run import prepare as prepare_run
 from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.training import bar
 from xplanes.training.fit import Estimate
 from xplanes.training.logs import forget_later
 from xplanes.training.module import RadianceModule
@@ -326,7 +329,12 @@ def test_a_run_says_at_its_ends_what_it_takes_and_what_comes_next(scenes, tmp_pa
     assert "GB" not in line  # Fragments of the heap, which nothing foretells, are half of it.
     assert printed.index("estimate") < printed.index("step 6/6")
     last = printed.split("step 6/6")[1]
-    peak = metrics(tmp_path)["peak_memory_bytes"]
+    content = metrics(tmp_path)
+    peak, spent = content["peak_memory_bytes"], content["seconds"]
+    assert 0 < content["cpu_share"] < os.cpu_count() + 1
+    assert f"{spent['total']:.1f} s in all" in last
+    for name in ("load", "evaluate", "other"):
+        assert (f"{spent[name]:.1f} s" in last) == (spent[name] >= 1), name
     assert f"memory   {peak / 2**30:.1f} GB" in last
     assert "tensorboard --logdir" in last
     assert f"xplanes render {tmp_path}" in last
@@ -340,6 +348,25 @@ def test_a_run_says_at_its_ends_what_it_takes_and_what_comes_next(scenes, tmp_pa
         assert len(set(steps)) == len(steps), tag
     parts = events.summary_metadata
     assert {"_hparams_/experiment", "_hparams_/session_start_info"} <= set(parts)
+
+
+def test_a_busy_machine_is_told_of_and_scoring_counts_its_views(
+    scenes, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(bar, "PIPED_SECONDS", 0.0)
+    monkeypatch.setattr(report, "training_share", lambda trainer: 0.31)
+    config = small_config(scenes, "trainer.max_steps=2", "logger=none")
+    run(config, tmp_path / "run", [], resume=False)
+    shown = capsys.readouterr().out
+    assert "scoring: 1 of 2 views" in shown
+    assert "scoring: 3 of 3 views" in shown
+    assert "warning  training got 0.3 s of CPU time a second: other programs" in shown
+
+
+def test_a_launcher_that_is_not_installed_names_its_extra(monkeypatch):
+    monkeypatch.setattr(config_module, "LAUNCHERS", ("absent",))
+    assert "[sweep]" in near_names(["hydra/launcher=absent"])
+    assert "[sweep]" not in near_names(["hydra/launcher=basci"])
 
 
 def test_nothing_is_offered_that_a_run_does_not_leave(scenes, tmp_path, capsys):

@@ -508,10 +508,13 @@ def test_errors_are_one_line_and_leave_1(tmp_path, monkeypatch, capsys):
     )
     (tmp_path / "packed").mkdir()
     (tmp_path / "packed" / "renders.zip").touch()
+    (tmp_path / "trained").mkdir()
+    (tmp_path / "trained" / "run.json").touch()
     cases = [
         (["missing"], "missing is not a folder"),
         (["."], r"not a scene of a known format. Scenes inside it: away, ball"),
         (["packed"], r"contains renders\.zip\. Unpack renders\.zip first.*ns-process-data"),
+        (["trained"], "trained is a run, not a scene: xplanes render"),
         (["ball", "ball"], "give one folder"),
         (["ball", "--out", "ball/a.png"], "the scene's own folder"),
         (["ball", "--out", "a.jpg"], "must end in .png"),

@@ -110,6 +110,7 @@ def test_no_checkpoint_between_the_batches_of_an_update(scenes, tmp_path, monkey
     run(small_config(scenes, *every, "trainer.max_steps=2"), folder, [], resume=False)
     note_checkpoints(written, monkeypatch)
     run(small_config(scenes, *every, "trainer.max_steps=3"), folder, [], resume=True)
+    assert "resumed  after step 2, 0 s of training" in (folder / "train.log").read_text()
     batches = [state["progress"]["batches"] for _, state in written]
     assert batches[-1] == 12
     assert all(count % 4 == 0 for count in batches)

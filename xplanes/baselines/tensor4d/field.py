@@ -173,8 +173,9 @@ class Tensor4D(SurfaceField):
             [N, width], and the points in canonical space [N, 3].
         """
         trained = torch.is_grad_enabled()
-        with torch.enable_grad():
-            points = points.detach().requires_grad_()
+        # Lightning scores in inference mode, whose tensors autograd cannot use.
+        with torch.inference_mode(False), torch.enable_grad():
+            points, times = points.detach().clone().requires_grad_(), times.clone()
             places = self.canonical(points, times)
             distance, features = self.distance(places)
             (slope,) = torch.autograd.grad(distance.sum(), points, create_graph=trained)

@@ -75,6 +75,33 @@ def write_statue(folder: Path) -> None:
     (folder / "transforms.json").write_text(json.dumps({**content, "frames": frames}))
 
 
+def write_hand(folder: Path) -> None:
+    """nerfstudio's transforms.json for the frames of one moving camera."""
+    views = ball(16)
+    focal = float(views.intrinsics.focal[0, 0])
+    frames = []
+    for index, pose in enumerate(views.camera_to_world.tolist()):
+        name = f"images/image{index + 50:06d}.jpg"
+        save(folder / name, opaque(views.image(index)))
+        frames.append({"file_path": name, "transform_matrix": pose, "time": index / 15})
+    content = {"fl_x": focal, "w": SIZE, "h": SIZE, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def write_fly(folder: Path) -> None:
+    """A folder of images for each camera, and one frame each in transforms.json."""
+    poses, times = ball(CAMERAS).camera_to_world, torch.linspace(0, 1, FRAMES)
+    cameras = []
+    for camera, pose in enumerate(poses):
+        views = ball(FRAMES, poses=pose.repeat(FRAMES, 1, 1), times=times)
+        for index in range(FRAMES):
+            save(folder / f"cam{camera}" / f"{index:04d}.jpg", opaque(views.image(index)))
+        focal = float(views.intrinsics.focal[0, 0])
+        known = {"fl_x": focal, "w": SIZE, "h": SIZE, "transform_matrix": pose.tolist()}
+        cameras.append({"file_path": f"cam{camera}/0000.jpg", **known})
+    (folder / "transforms.json").write_text(json.dumps({"frames": cameras}))
+
+
 def write_kitchen(folder: Path) -> None:
     """Neural 3D Video's calibration, with folders of images."""
     poses = ball(CAMERAS).camera_to_world
@@ -112,6 +139,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     captures = root / "captures"
     write_dancer(captures / "dancer")
     write_statue(captures / "statue")
+    write_hand(captures / "hand")
+    write_fly(captures / "fly")
     write_kitchen(captures / "kitchen")
     write_fern(captures / "fern")
     NerfiesFolder(captures / "broom", 10)
@@ -137,7 +166,7 @@ def each_capture(program: str) -> list[Any]:
     """The page's commands of a program; further ones on the same capture are slow."""
     found, seen = [], set()
     for words in commands(program):
-        names = re.findall("dancer|statue|excavator|broom|fern|kitchen", " ".join(words))
+        names = re.findall("dancer|statue|excavator|broom|fern|kitchen|hand|fly", " ".join(words))
         again = pytest.mark.slow if set(names) <= seen else ()
         found.append(pytest.param(words, marks=again, id=" ".join(words)))
         seen |= set(names)
@@ -148,7 +177,8 @@ def each_capture(program: str) -> list[Any]:
 def test_inspect_as_the_page_says(words, place, monkeypatch, capsys):
     monkeypatch.chdir(place)
     before = {path: path.stat().st_mtime_ns for path in (place / "captures").rglob("*")}
-    assert main(["inspect", *words]) == 0, capsys.readouterr().err
+    smaller = [re.sub(r"^data.resolution=\d+$", "data.resolution=24", text) for text in words]
+    assert main(["inspect", *smaller]) == 0, capsys.readouterr().err
     printed = capsys.readouterr().out
     if "--json" in words:
         picture = json.loads(printed)["picture"]
@@ -162,7 +192,7 @@ def test_inspect_as_the_page_says(words, place, monkeypatch, capsys):
 def small(words: list[str]) -> list[str]:
     """A command's settings, with what makes a run short."""
     kept = [text for text in SMALL if not text.startswith(("data.", "lrm="))]
-    sizes = ["data.resolution=24" if text == "data.resolution=400" else text for text in words]
+    sizes = [re.sub(r"^data.resolution=\d+$", "data.resolution=24", text) for text in words]
     if "data=llff" in words:  # Whose images are looked for at 400 pixels if nobody says more.
         sizes.append("data.resolution=24")
     return [*sizes, *kept, "lrm=none", "trainer.max_steps=2", "callbacks.evaluation.at=[0]"]

@@ -6,6 +6,7 @@ import torch
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
 from xplanes.models.initialisation import Method
+from xplanes.rendering import grid_renderer
 from xplanes.rendering.grid_renderer import OccupancySampler
 from xplanes.rendering.sampler import Site
 from xplanes.scenes.frame import cube_frame
@@ -36,7 +37,10 @@ def along_the_diagonal() -> dict[str, torch.Tensor]:
     }
 
 
-def test_images_of_the_trained_field_have_samples_of_their_own(sampling):
+def test_images_of_the_trained_field_have_samples_of_their_own(sampling, monkeypatch):
+    seen = sampling.renderer.render(fog, **along_the_diagonal())
+    assert len(seen.samples) == STEPS_OF_A_RAY["training"]  # Nothing is pruned yet.
+    monkeypatch.setattr(grid_renderer, "UNPRUNED", 1.0)
     seen = sampling.renderer.render(fog, **along_the_diagonal())
     assert len(seen.samples) == STEPS_OF_A_RAY["pictures"]
     state = TrainingState(0, sampling.pruned_at, 0, 0)

@@ -39,6 +39,12 @@ FEWEST_SAMPLES, SAMPLES_PER_PIXEL = 128, 0.5
 BINS, MOST_BINS = 8, 16
 """Usual and maximum number of time bins of the grid with time_bins=auto."""
 
+UNPRUNED = 0.9
+"""Share of occupied cells above which images have no more samples than training batches.
+
+Nearly all of them reach the field then, which is too smooth to tell the difference.
+"""
+
 SPARSE_POINTS = 2048
 """Points at which the sparsity prior is evaluated."""
 
@@ -352,7 +358,10 @@ class OccupancySampler(Sampler):
 
     @property
     def renderer(self) -> GridRenderer:
-        return self._images
+        images = self._images
+        if images.samples > self._along and self.grid.occupied_fraction > UNPRUNED:
+            return replace(images, samples=self._along)
+        return images
 
     @property
     def parts(self) -> dict[str, nn.Module]:

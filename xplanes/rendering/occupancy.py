@@ -100,6 +100,8 @@ class OccupancyGrid(nn.Module):
     @property
     def occupied_fraction(self) -> float:
         """Share of all cells that are occupied."""
+        if self.occupied.device.type == "cpu":
+            return np.count_nonzero(self.occupied.numpy()) / self.occupied.numel()
         return float(self.occupied.float().mean())
 
     @torch.no_grad()

@@ -1,6 +1,7 @@
 """The fixed-view video: the scene's own, or rendered by a field."""
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -430,3 +431,16 @@ def test_the_video_of_a_field_in_a_world_shows_the_cube_alone(tmp_path):
     assert (frames[..., :3] <= frames[..., 3:] + 1).all()
     assert frames[..., 3].min() < 250
     assert "no silhouettes" in said[0]
+
+
+@pytest.mark.parametrize("share", [-1.1, -0.9, 0.9, 1.1])
+def test_the_camera_of_a_video_may_be_off_by_a_little(share):
+    views = ball_views(3, 0.6, size=40)
+    known = views.intrinsics
+    oblong = known.focal * torch.tensor([1 + share * module.OBLONG, 1.0])
+    aside = known.centre + torch.tensor([0.0, share * module.OFF_CENTRE * 40])
+    cases = ({"focal": oblong}, "expect square pixels"), ({"centre": aside}, "at the centre")
+    for values, words in cases:
+        other = replace(views, intrinsics=replace(known, **values))
+        with pytest.raises(SceneError, match=words) if abs(share) > 1 else nullcontext():
+            module.check_camera(other)

@@ -62,30 +62,16 @@ def write_dancer(folder: Path) -> None:
     (folder / "times.csv").write_text("\n".join(["file,time", *rows]) + "\n")
 
 
-def write_statue(folder: Path) -> None:
-    """nerfstudio's transforms.json."""
+def write_transforms(folder: Path, first: int = 0, ending: str = "png", **content: Any) -> None:
+    """nerfstudio's transforms.json, with images numbered from ``first``."""
     views = ball(16)
-    focal = float(views.intrinsics.focal[0, 0])
     frames = []
     for index, pose in enumerate(views.camera_to_world.tolist()):
-        name = f"images/frame_{index:05d}.png"
+        name = f"images/image{first + index:06d}.{ending}"
         save(folder / name, opaque(views.image(index)))
         frames.append({"file_path": name, "transform_matrix": pose, "time": index / 30})
-    content = {"camera_model": "OPENCV", "fl_x": focal, "w": SIZE, "h": SIZE, "k1": 0.01}
+    content |= {"fl_x": float(views.intrinsics.focal[0, 0]), "w": SIZE, "h": SIZE}
     (folder / "transforms.json").write_text(json.dumps({**content, "frames": frames}))
-
-
-def write_hand(folder: Path) -> None:
-    """nerfstudio's transforms.json for the frames of one moving camera."""
-    views = ball(16)
-    focal = float(views.intrinsics.focal[0, 0])
-    frames = []
-    for index, pose in enumerate(views.camera_to_world.tolist()):
-        name = f"images/image{index + 50:06d}.jpg"
-        save(folder / name, opaque(views.image(index)))
-        frames.append({"file_path": name, "transform_matrix": pose, "time": index / 15})
-    content = {"fl_x": focal, "w": SIZE, "h": SIZE, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(content))
 
 
 def write_fly(folder: Path) -> None:
@@ -138,8 +124,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("work")
     captures = root / "captures"
     write_dancer(captures / "dancer")
-    write_statue(captures / "statue")
-    write_hand(captures / "hand")
+    write_transforms(captures / "statue", camera_model="OPENCV", k1=0.01)
+    write_transforms(captures / "hand", first=50, ending="jpg")
     write_fly(captures / "fly")
     write_kitchen(captures / "kitchen")
     write_fern(captures / "fern")

@@ -109,10 +109,10 @@ def test_a_snapshot_shows_the_field_at_its_time(plane_set, time_rows, fine):
     points, _ = scattered(300, torch.float64)
     points = 1.3 * points  # Beyond the cube the planes fade to zero.
     for time in (0.0, 0.25, 0.6, 1.0, 1.5):
-        still = field.snapshot(time)
-        assert not still.moves
+        at_once = field.snapshot(time)
+        assert not at_once.moves
         times = torch.full((300,), time, dtype=torch.float64)
-        for found, expected in zip(still(points, 1 - times), field(points, times), strict=True):
+        for found, expected in zip(at_once(points, 1 - times), field(points, times), strict=True):
             torch.testing.assert_close(found, expected, atol=1e-12, rtol=1e-12)
 
 

@@ -51,8 +51,8 @@ def test_cameras_that_move_or_show_nothing_that_changes_are_left_alone():
     views, _ = rig()
     moved = views.camera_to_world + 1e-3 * torch.rand(len(views), 1, 1)
     assert changing(replace(views, camera_to_world=moved), [0] * len(views)) is None
-    still = replace(views, images=views.images[:1].expand_as(views.images).contiguous())
-    assert changing(still, [0] * len(views)) is None
+    static = replace(views, images=views.images[:1].expand_as(views.images).contiguous())
+    assert changing(static, [0] * len(views)) is None
     assert changing(views.subset(torch.arange(2 * CAMERAS)), [0] * 2 * CAMERAS) is None
 
 

@@ -576,10 +576,20 @@ def test_models_that_lie(capture):
         capture.write()
         with pytest.warns(UserWarning, match=r"1 of 8 images are left out:\n.*frame_004\.p"):
             assert len(capture.views()) == 7
-    capture.poses = whole
+    capture.poses = whole.copy()
+    capture.write()
+    near = capture.views()
     capture.poses[:, :3, 3] += 4e6
     capture.write()
-    capture.refused("cameras lie up to 4e.06 world units .*single precision.*model_transformer")
+    with pytest.warns(UserWarning, match=r"read relative to \(40000"):
+        far = capture.views()
+    shift = (far.camera_to_world - near.camera_to_world)[:, :3, 3]
+    torch.testing.assert_close(shift, shift[:1].expand_as(shift), atol=1e-5, rtol=0)
+    capture.poses[0, :3, 3] += 1e30
+    capture.write()
+    capture.refused("cameras lie up to .*single precision.*model_transformer")
+    capture.poses = whole
+    capture.write()
     generator = np.random.default_rng(0)
     require_precision(Path("video"), 4 + 4e-5 * generator.random((5, 3)))  # A camera that trembles.
     path = capture.path / "sparse/0/images.bin"

@@ -119,7 +119,7 @@ def test_what_is_faint_all_over_is_kept_without_its_noise():
         noise = torch.rand(alpha.shape, generator=torch.Generator().manual_seed(0)) < 0.01
         noisy = torch.where(noise, torch.maximum(alpha, torch.tensor(2).byte()), alpha)
         assert torch.equal(silhouette_of(noisy), alpha >= FAINT), peak
-    # A few opaque specks do not make the image opaque.
+    # A few stray opaque pixels do not make the image opaque.
     alpha = (0.06 * disc(60).float()).round().byte()
     speckled = alpha.clone()
     speckled[[4, 60, 190], [7, 193, 20]] = 255
@@ -157,7 +157,7 @@ def noisy(share, alpha=2):
 
 
 def speckled(images):
-    """Four opaque specks of up to 2 x 2 pixels in each image, near its corners."""
+    """Four stray opaque pixels of up to 2 x 2 pixels in each image, near its corners."""
     for number, image in enumerate(images):
         for row, column, side in ((4, 9, 1), (15, -7, 2), (-9, -30, 1), (-20, 5, 2)):
             row, column = row % SIZE - number // 4, column % SIZE - number % 4
@@ -237,11 +237,11 @@ def test_pixels_that_no_silhouette_holds_keep_colour_and_time():
         faint += int(stray.sum())
         expected = torch.tensor([1, 1, 0]) / 255 + (1 - 12 / 255)
         assert torch.allclose(batch["target"][stray], expected, atol=1e-5)
-        still = torch.isin(batch["times"], views.times)
-        assert still[stray].all()
+        unmoved = torch.isin(batch["times"], views.times)
+        assert unmoved[stray].all()
         clear = batch["alpha"] == 0
         empty += int(clear.sum())
-        moved += int((~still)[clear].sum())
+        moved += int((~unmoved)[clear].sum())
     assert faint > 1000
     assert moved > 0.5 * empty
 

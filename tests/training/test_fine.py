@@ -32,11 +32,11 @@ def test_fine_planes_have_the_texels_that_the_images_show(pixels, texels):
 
 def test_planes_do_not_follow_pixels_where_things_move_before_surroundings():
     moving = ball_views(4, 0.4, centre=swinging(0.5, 1), size=20)
-    still = replace(moving, times=torch.zeros_like(moving.times))
+    static = replace(moving, times=torch.zeros_like(moving.times))
     frame = cube_frame(1.0, torch.zeros(3))
     pixels = pixels_across(moving, frame)
     assert pixels > 0
-    found = [pixels_of_detail(v, frame, s) for v in (moving, still) for s in (False, True)]
+    found = [pixels_of_detail(v, frame, s) for v in (moving, static) for s in (False, True)]
     assert found == [pixels, 0, pixels, pixels]
 
 

@@ -138,9 +138,9 @@ def estimated(
     steps_at = [share * whole for share in {*at, 1.0} if not done or share * whole > done]
     images = sum(pixels * expected.ray(step) for step in steps_at)
     if final is not views or count < len(views):
-        images += final.height * final.width * len(final) * expected.later_ray
+        images += final.height * final.width * len(final) * expected.ray(whole)
     if experiment.media:
-        images += FRAMES * video_size(data.scene.splits["train"]) ** 2 * expected.later_ray
+        images += FRAMES * video_size(data.scene.splits["train"]) ** 2 * expected.ray(whole)
     parts = f"{spent:.0f} s so far, {{}} of training, {images:.0f} s of scores and images"
     if train == math.inf:
         return parts.format("no end")

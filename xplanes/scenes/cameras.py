@@ -268,7 +268,7 @@ def upright(up_vectors: Tensor) -> Tensor | None:
 def camera_around(
     azimuth: float, elevation: float, distance: float, target: Tensor | None = None
 ) -> Tensor:
-    """Pose of a camera that looks at ``target`` (the origin when None) from a direction.
+    """Pose of a camera that faces ``target`` (the origin when None) from a direction.
 
     Args:
         azimuth: In degrees, from the world's x axis towards y.

@@ -74,7 +74,7 @@ def read_scene(settings: SceneSettings, splits: Sequence[str], mask_use: MaskUse
 def _listed(split: str, path: Path, span: tuple[float, float] | None) -> Listing:
     """The frames of a split; if a scored split has none, warns before `MissingSplitError`."""
     try:
-        return listing_of(path, read_frames(path), span)
+        return listing_of(path, read_frames(path), span, movable=False)
     except MissingSplitError as problem:
         if split != "train":
             first, *others = str(problem).splitlines()  # BlenderNeRF writes cameras without images.
@@ -119,7 +119,7 @@ def _list_video(folder: Path, span: tuple[float, float] | None) -> Listing | Non
     path = folder / "transforms_video.json"
     if not path.is_file():
         return None
-    listing = listing_of(path, read_frames(path), span)
+    listing = listing_of(path, read_frames(path), span, movable=False)
     poses = listing.camera_to_world
     if not poses.allclose(poses[:1].expand_as(poses), atol=1e-4):
         raise SceneError(

@@ -441,6 +441,35 @@ def require_precision(source: Path, positions: np.ndarray) -> None:
         )
 
 
+def origin_near(source: Path, positions: np.ndarray) -> np.ndarray:
+    """A point relative to which single precision resolves the cameras: if possible, the origin.
+
+    Captures in map coordinates lie millions of metres away, where numbers are half a metre apart.
+
+    Args:
+        source: As for `require_precision`.
+        positions: As for `require_precision`.
+
+    Returns:
+        float64 [3]
+
+    Raises:
+        SceneError: If there is no such point.
+    """
+    origin = np.zeros(3)
+    try:
+        require_precision(source, positions)
+    except SceneError:
+        origin = positions.mean(axis=0).round()
+        require_precision(source, positions - origin)
+        x, y, z = origin.tolist()
+        warn(
+            f"{source}: the origin is far away, so positions are read relative to "
+            f"({x:.0f}, {y:.0f}, {z:.0f}): data.centre and exports are as well."
+        )
+    return origin
+
+
 def refuse_repeats(
     labels: Sequence[str], paths: Sequence[Path], poses: np.ndarray, times: Sequence[float]
 ) -> None:

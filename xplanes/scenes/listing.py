@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from xplanes.errors import MissingSplitError, SceneError, refuse_all, warn
-from xplanes.scenes.entries import refuse_repeats, require_precision, some
+from xplanes.scenes.entries import origin_near, refuse_repeats, require_precision, some
 from xplanes.scenes.formats import UNTURN, mask_misfit, orientation
 from xplanes.scenes.images import GREY, Size, final_sizes, native_sizes, read_images
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
@@ -111,6 +111,7 @@ class Listing:
             pixels are to be ignored); empty if it does not define it.
         clear: Grey levels, out of 255, that are transparent in its images.
         time_source: Source of the times, with examples; empty if there are no times.
+        origin: Origin of the poses in the files' world.
     """
 
     paths: tuple[Path, ...]
@@ -123,6 +124,7 @@ class Listing:
     mask_meaning: str = ""
     clear: tuple[int, ...] = ()
     time_source: str = ""
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __len__(self) -> int:
         return len(self.files)
@@ -135,6 +137,7 @@ class Listing:
         paths: Sequence[Path],
         poses: np.ndarray,
         times: Sequence[float],
+        movable: bool = True,
         **more: Any,
     ) -> "Listing":
         """A list of images that has passed the checks common to all formats.
@@ -145,19 +148,27 @@ class Listing:
             paths: Image files. [V]
             poses: Camera-to-world matrices with OpenGL's axes. float64 [V, 4, 4]
             times: From 0 to 1; empty for a static scene. [V]
+            movable: Whether the poses may get another origin, if the files' is too far away.
             **more: Further attributes.
 
         Raises:
             SceneError: If cameras are too far away, an image is listed twice, or the sizes of files
                 and calibrations do not match.
         """
-        require_precision(source, poses[:, :3, 3])
+        positions, origin = poses[:, :3, 3], np.zeros(3)
+        if movable:
+            origin = origin_near(source, positions)
+            poses = poses.copy()
+            poses[:, :3, 3] = positions - origin
+        else:
+            require_precision(source, positions)
         refuse_repeats(labels, paths, poses, times)
         listing = cls(
             paths=tuple(paths),
             camera_to_world=torch.from_numpy(poses).float(),
             times=torch.tensor(times or [0.0] * len(paths), dtype=torch.float32),
             timed=bool(times),
+            origin=tuple(origin.tolist()),
             **more,
         )
         _require_shapes(listing)

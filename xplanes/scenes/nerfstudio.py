@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from xplanes.errors import BrokenFrameError, SceneError, first_of, warn
-from xplanes.scenes.entries import checked_pose, image_path, require_precision, short
+from xplanes.scenes.entries import image_path, short
 from xplanes.scenes.listing import Listing, held_out
 from xplanes.scenes.multicamera import is_rig
 from xplanes.scenes.source import CaptureSettings
@@ -44,7 +43,7 @@ class NerfstudioSettings(CaptureSettings):
         path = self.folder / "transforms.json"
         if not path.is_file():
             raise self.no_scene()
-        content = _near_origin(path, read_frames(path))
+        content = read_frames(path)
         listing = listing_of(path, content)
         places = _listed_splits(path, content, listing) or held_out(listing, self.eval_every)
         if "train" in splits and not places.get("train"):
@@ -61,44 +60,6 @@ def _up(content: Mapping[str, Any]) -> Tensor | None:
         if up.shape == (3,) and 0 < float(up.norm()) < math.inf:
             return up / up.norm()
     return None
-
-
-def _near_origin(path: Path, content: dict[str, Any]) -> dict[str, Any]:
-    """The content, with poses relative to their mean if the world's origin is too far away.
-
-    Captures in map coordinates lie millions of metres from it, and single precision resolves half
-    a metre there.
-    """
-    frames, places = content["frames"], []
-    for index, frame in enumerate(frames):
-        with suppress(SceneError):
-            places.append(checked_pose(f"frame {index}", frame["transform_matrix"])[:3, 3])
-    if not places:
-        return content
-    positions = np.array(places)
-    offset = positions.mean(axis=0).round()
-    try:
-        require_precision(path, positions)
-        return content
-    except SceneError:
-        with suppress(SceneError):
-            require_precision(path, positions - offset)
-            x, y, z = offset.tolist()
-            warn(
-                f"{path}: the origin is far away, so positions are read relative to "
-                f"({x:.0f}, {y:.0f}, {z:.0f}): data.centre and exports are as well."
-            )
-            return content | {"frames": [_moved(frame, offset) for frame in frames]}
-        return content
-
-
-def _moved(frame: Mapping[str, Any], offset: np.ndarray) -> dict[str, Any]:
-    """A frame with its camera's position relative to a point, if it has a pose. float64 [3]"""
-    with suppress(SceneError):
-        pose = checked_pose("", frame["transform_matrix"])
-        pose[:3, 3] -= offset
-        return {**frame, "transform_matrix": pose.tolist()}
-    return dict(frame)
 
 
 def _listed_splits(

@@ -53,14 +53,14 @@ def as_static(scene: Scene, reason: str) -> Scene:
         reason: Why the scene is known to be static, for the header of a run.
     """
 
-    def still(views: Views) -> Views:
+    def at_one_time(views: Views) -> Views:
         return replace(views, times=torch.zeros_like(views.times))
 
     return replace(
         scene,
-        splits={name: still(views) for name, views in scene.splits.items()},
-        video=None if scene.video is None else still(scene.video.subset([0])),
-        lrm_views=None if scene.lrm_views is None else still(scene.lrm_views),
+        splits={name: at_one_time(views) for name, views in scene.splits.items()},
+        video=None if scene.video is None else at_one_time(scene.video.subset([0])),
+        lrm_views=None if scene.lrm_views is None else at_one_time(scene.lrm_views),
         static_reason=reason,
     )
 
@@ -354,7 +354,7 @@ class CaptureSettings(SceneSettings, ABC):
         if not any(listing.masks):
             warn_of_masks(self.folder, listing.paths)
         turn, words = world_turn(listing.camera_to_world, listing.paths, self.orient, up)
-        found = None if points is None else torch.from_numpy(points)
+        found = None if points is None else torch.from_numpy(points - np.array(listing.origin))
         if turn is not None:
             listing = listing.turned(turn)
             found = None if found is None else found @ turn.T

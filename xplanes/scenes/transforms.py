@@ -122,7 +122,11 @@ def time_span(paths: Sequence[Path]) -> tuple[float, float] | None:
 
 
 def listing_of(
-    path: Path, content: Mapping[str, Any], span: tuple[float, float] | None = None
+    path: Path,
+    content: Mapping[str, Any],
+    span: tuple[float, float] | None = None,
+    *,
+    movable: bool = True,
 ) -> Listing:
     """The frames of a transforms file, checked.
 
@@ -133,6 +137,7 @@ def listing_of(
         content: Result of `read_frames`.
         span: First and last time of the scene, if it has several files; those of this one when
             None.
+        movable: As for `Listing.checked`: false if the scene has several files.
 
     Raises:
         SceneError: If anything is missing, out of range, repeated, or outside the scene's folder.
@@ -152,6 +157,7 @@ def listing_of(
         paths,
         np.stack([frame.pose for frame in frames]),
         times,
+        movable,
         files=tuple(image.relative_to(folder).as_posix() for image in paths),
         calibrations=_calibrations(path, content, frames),
         masks=tuple(masks) if any(masks) else (),

@@ -196,6 +196,9 @@ def inspect(choice: Choice) -> Capture:
         choice.scene.prepare()
         scene, model = choice.scene.read(), choice.model
     said = dict.fromkeys(str(each.message) for each in caught if each.category is UserWarning)
+    for each in caught:
+        if each.category is not UserWarning:  # Of a library: for developers.
+            warnings.showwarning(each.message, each.category, each.filename, each.lineno)
     train = scene.splits["train"]
     frame, problem = None, ""
     try:

@@ -56,18 +56,6 @@ class StepBar(ProgressBar):
             self._write(self.line(trainer, pl_module), last=True)
             self._width = 0
 
-    def on_validation_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
-    ) -> None:
-        counts = trainer.num_sanity_val_batches if trainer.sanity_checking else None
-        self._scored(trainer, batch_idx + 1, counts or trainer.num_val_batches)
-
     def on_test_batch_end(
         self,
         trainer: Trainer,
@@ -77,18 +65,20 @@ class StepBar(ProgressBar):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        self._scored(trainer, batch_idx + 1, trainer.num_test_batches)
+        if not self._shown or not trainer.is_global_zero or time.monotonic() < self._due:
+            return
+        self._due = time.monotonic() + self._every
+        counts = trainer.num_val_batches
+        if trainer.testing or trainer.sanity_checking:
+            counts = trainer.num_test_batches if trainer.testing else trainer.num_sanity_val_batches
+        self._write(f"scoring: {batch_idx + 1} of {sum(map(int, counts))} views")
+
+    on_validation_batch_end = on_test_batch_end
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self.live and self._width:
             self.stream.write("\r" + " " * self._width + "\r")
             self._width = 0
-
-    def _scored(self, trainer: Trainer, done: int, counts: Any) -> None:
-        if not self._shown or not trainer.is_global_zero or time.monotonic() < self._due:
-            return
-        self._due = time.monotonic() + self._every
-        self._write(f"scoring: {done} of {sum(map(int, counts))} views")
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException

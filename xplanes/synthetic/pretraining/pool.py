@@ -31,7 +31,7 @@ FOCAL = 0.5 / math.tan(0.5 * CAMERA_ANGLE_X)
 
 
 def camera(azimuth: float, elevation: float) -> Array:
-    """Pose of a camera that looks at the origin, at D-NeRF's distance; degrees. [4, 4]"""
+    """Pose of a camera that faces the origin, at D-NeRF's distance; degrees. [4, 4]"""
     turn, rise = math.radians(azimuth), math.radians(elevation)
     flat = math.cos(rise)
     place = [flat * math.cos(turn), flat * math.sin(turn), math.sin(rise)]

@@ -25,7 +25,7 @@ from xplanes.files import require_writable
 
 logger = logging.getLogger(__name__)
 
-COMPILING = 15
+COMPILING = 20
 """Seconds that numba takes to compile the loops of training and rendering."""
 
 

@@ -52,7 +52,7 @@ STAGES = (
     ("scoring", "xplanes.training.module", "RadianceModule.validation_step"),
     ("checkpoints", "xplanes.training.checkpoints", "Checkpoints._save_checkpoint"),
     ("TensorBoard", "lightning.pytorch.loggers.tensorboard", "TensorBoardLogger.log_metrics"),
-    ("video", "xplanes.evaluation.render", "write_orbit"),
+    ("video", "xplanes.evaluation.render", "write_run_video"),
     ("Lightning's loop", "xplanes.training.fit", "Trainer.train"),
 )
 """Name of the stage, module and function."""

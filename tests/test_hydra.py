@@ -9,6 +9,7 @@ import time
 from types import SimpleNamespace
 
 import pytest
+import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -27,6 +28,7 @@ from xplanes.launch import prepare
 from xplanes.run import prepare as prepare_run
 from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.frame import Frame
 from xplanes.training import bar
 from xplanes.training.fit import Estimate
 from xplanes.training.logs import forget_later
@@ -303,11 +305,12 @@ def test_the_estimate_counts_every_image_as_the_field_is_when_it_is_drawn(scenes
     experiment = prepare_run(small_config(scenes, *changes), tmp_path).experiment
     data = SceneDataModule(experiment.data, seed=0)
     data.setup("fit")
+    frame = Frame(1.0, torch.eye(3), torch.zeros(3))
     expected = Estimate(step=0.5, first_ray=5.0, later_ray=1.0, pruned_at=1000)
     assert [expected.ray(step) for step in (0, 85, 170, 999, 1000)] == [5, 3, 2, 2, 1]
     validated, tested, video = 2 * 32**2, 3 * 32**2, FRAMES * 64**2
     images = validated * (5 + 3 + 2) + 2 * (tested + video)
-    said = estimated(experiment, data, expected, 7.0)
+    said = estimated(experiment, data, frame, expected, 7.0)
     parts = f"7 s so far, 85 s of training, {images} s of scores and images"
     total, advice = said.split("\n")
     assert total == f"{7 + 85 + images} s in all: {parts}"
@@ -315,7 +318,7 @@ def test_the_estimate_counts_every_image_as_the_field_is_when_it_is_drawn(scenes
     # After a resume, neither steps nor evaluations are counted again.
     images -= validated * (5 + 3)
     rest = f"{7 + 35 + images} s in all: 7 s so far, 35 s of training, {images} s of scores and"
-    assert estimated(experiment, data, expected, 7.0, 100, 50.0).startswith(rest)
+    assert estimated(experiment, data, frame, expected, 7.0, 100, 50.0).startswith(rest)
 
 
 def test_a_run_says_at_its_ends_what_it_takes_and_what_comes_next(scenes, tmp_path, capsys):

@@ -17,7 +17,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from xplanes.backend import warm_up
 from xplanes.errors import XPlanesError
 from xplanes.evaluation.findings import scene_findings
-from xplanes.evaluation.render import FRAMES, write_orbit
+from xplanes.evaluation.render import write_run_video
 from xplanes.evaluation.report import closing, header, log_hparams, rest, summary, write_pictures
 from xplanes.experiment import Experiment
 from xplanes.files import StorageError, clear_unfinished, storage_errors, write_json
@@ -227,8 +227,8 @@ def train(
     metrics["decomposition"] = found.report
     metrics["lrm"] = found.lrm
     if experiment.media:
-        say(f"rendering {FRAMES} frames of the orbit video ...")
-        metrics["media"] = str(write_orbit(module, scene, folder).relative_to(folder))
+        say("rendering the video ...")
+        metrics["media"] = str(write_run_video(module, scene, folder).relative_to(folder))
     seconds |= rest(seconds, record.total_seconds)
     write_json(folder / "metrics.json", metrics)
     log_hparams(trainer, experiment, metrics)

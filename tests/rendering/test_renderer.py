@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.training.runs import changed
-from xplanes.rendering import front_to_back
+from xplanes.rendering import front_to_back, grid_renderer
 from xplanes.rendering.grid_renderer import (
     DIAGONAL,
     GridRenderer,
@@ -172,6 +172,7 @@ def test_an_image_does_not_depend_on_how_many_samples_are_taken_at_a_time(monkey
 
 def test_an_image_does_not_ask_for_what_surfaces_hide(monkeypatch):
     monkeypatch.setattr(front_to_back, "AT_ONCE", 64)
+    monkeypatch.setattr(grid_renderer, "UNPRUNED", 1.0)
     asked = []
 
     def wall(points, times):

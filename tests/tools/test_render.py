@@ -1,6 +1,7 @@
 """Rendered videos: camera paths, times and output files."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from PIL import Image
 
 from xplanes.errors import ConfigError
-from xplanes.evaluation.render import write_video
+from xplanes.evaluation.render import followed, write_video
 from xplanes.optional import MissingExtraError
 from xplanes.rendering.pictures import to_bytes
 from xplanes.tools.render import VideoOptions, cameras, find_view, render_video, times
@@ -135,3 +136,41 @@ def test_options_out_of_range_are_refused():
     for options, words in refused.items():
         with pytest.raises(ConfigError, match=words):
             options.check()
+
+
+def test_a_video_stays_with_the_camera_of_a_rig(trained):
+    views = trained.scene.splits["train"]
+    poses = views.camera_to_world[[0, 1, 1, 1, 1, 0]]
+    rig = replace(views.subset(range(6)), camera_to_world=poses, times=torch.arange(6) / 5)
+    indices, seen_at = followed(rig, 5)
+    assert indices == [1] * 5
+    assert seen_at.tolist() == [0, 0.25, 0.5, 0.75, 1]
+
+
+def test_a_video_follows_a_moving_camera_at_its_times(trained):
+    views = trained.scene.splits["train"].subset(range(6))
+    moving = replace(views, times=torch.tensor([0.5, 0.0, 1.0, 0.25, 0.5, 0.75]))
+    indices, seen_at = followed(moving, 5)
+    assert indices == [1, 3, 0, 5, 2]
+    assert seen_at.tolist() == [0, 0.25, 0.5, 0.75, 1]
+    assert followed(moving, 3)[0] == [1, 0, 2]
+    still = replace(views, times=torch.zeros(6))
+    assert followed(still, 7)[0] == [0, 1, 2, 2, 3, 4, 5]
+
+
+def test_cameras_of_the_training_views_are_a_path(trained):
+    options = VideoOptions("cameras", frames=3, size=20)
+    found = cameras(options, trained.scene.splits, trained.frame)
+    views = trained.scene.splits["train"]
+    indices, _ = followed(views, 3)
+    for camera, index in zip(found, indices, strict=True):
+        own = views.camera(index)
+        assert torch.equal(camera.camera_to_world, own.camera_to_world)
+        assert (camera.height, camera.width) == (20, 20)
+        corners = [seen.rays()[1].view(seen.height, seen.width, 3) for seen in (camera, own)]
+        middles = [rays.mean(dim=(0, 1)) for rays in corners]
+        torch.testing.assert_close(*middles, atol=1e-3, rtol=0)
+    path = render_video(trained, options)
+    assert path.name == "render_cameras_own.webp"
+    with Image.open(path) as video:
+        assert (video.n_frames, video.size) == (3, (20, 20))  # type: ignore[attr-defined]

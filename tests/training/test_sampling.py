@@ -65,3 +65,33 @@ def test_room_follows_the_samples_of_batches_and_pictures_need_none(tmp_path):
 def test_no_samples_for_images_are_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"model\.sampler\.render_samples=0: must be above 0"):
         Method.read(small_config(tmp_path, "model.sampler.render_samples=0"))
+
+
+def test_images_find_empty_space_that_the_grid_has_not_pruned_yet(tmp_path):
+    config = small_config(tmp_path, "model.sampler.grid_resolution=8", "model.sampler.samples=64")
+    site = Site(cube_frame(1.0, torch.zeros(3)), times=torch.rand(6), seed=0, precision="32")
+    asked = []
+
+    def half(points, times):
+        """Colourful fog on one side of the cube."""
+        asked.append(points)
+        return (0.5 + 0.5 * points).clamp(0, 1), 3.0 * (points[:, 0] < 0)
+
+    sampling = Method.read(config).model.sampler.build(half, site)
+    before = {name: value.clone() for name, value in sampling.grid.named_buffers()}
+    heights = torch.linspace(-0.9, 0.9, 8**3)
+    origins = torch.stack([torch.full_like(heights, -3.0), heights, 0.3 * heights], dim=1)
+    rays = origins, torch.tensor([1.0, 0, 0]).expand_as(origins)
+    found = sampling.renderer.image(half, *rays, 0.4, torch.ones(3))
+    searched = sum(map(len, asked[1:]))
+    assert len(asked[0]) == 8**3  # All cells of one bin, once.
+    asked.clear()
+    few = sampling.renderer.image(half, *(ray[:20] for ray in rays), 0.4, torch.ones(3))
+    alike = {name: value[:20] for name, value in found.items()}
+    torch.testing.assert_close(few, alike, atol=1e-5, rtol=0)
+    asked.clear()
+    sampling.renderer.image(half, *(ray[:20] for ray in rays), 0.4, torch.ones(3))
+    unsearched = sum(map(len, asked)) * len(heights) / 20
+    assert 0.5 * unsearched < searched < 0.7 * unsearched
+    for name, value in sampling.grid.named_buffers():
+        assert torch.equal(value, before[name]), name

@@ -7,12 +7,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from PIL import Image
 
 from tests.balls import ball_views, swinging
 from tests.baselines.runs import KPLANES, PROPOSAL, TINEUVOX
 from tests.training.runs import same_state, small_config, train_quietly
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.baselines.proposal import spaced, unspaced
+from xplanes.evaluation.render import FRAMES, RunVideo, write_run_video
 from xplanes.rendering.behind import background_colour
 from xplanes.scenes.views import Scene
 from xplanes.training.collapse import CollapseWatch
@@ -254,3 +256,18 @@ def test_samples_of_contracted_space_are_even_in_distance_then_in_its_inverse():
     torch.testing.assert_close(distances[near], 2 * places[near])
     step = (1 / distances[far]).diff()
     torch.testing.assert_close(step, step[:1].expand_as(step))
+
+
+def test_the_video_of_a_world_is_seen_from_where_cameras_were(tmp_path):
+    for kind in ("world", "alpha"):
+        module = built(kind)
+        video = RunVideo.of(scene(kind), module.frame)
+        poses = torch.stack([camera.camera_to_world for camera in video.cameras])
+        own = scene(kind).splits["train"].camera_to_world
+        nearest = torch.cdist(poses.flatten(1), own.flatten(1)).amin(dim=1)
+        assert bool((nearest < 1e-6).all()) == video.returns == (kind == "world")
+        assert video.pixels == len(video.cameras) * 48**2
+        path = write_run_video(module, scene(kind), tmp_path / kind)
+        with Image.open(path) as frames:
+            shown = 2 * len(video.cameras) - 2 if video.returns else FRAMES
+            assert (frames.n_frames, frames.size) == (shown, (48, 48))  # type: ignore[attr-defined]

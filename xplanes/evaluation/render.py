@@ -1,6 +1,7 @@
 """Videos along a path of cameras and times."""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -155,10 +156,73 @@ FRAMES, FPS = 48, 16
 VIDEO_SIZE = 200
 """Maximum side length in pixels of a run's video."""
 
+FEWEST_TIMES = 4
+"""Least number of timesteps that one camera shows in a video from a single camera."""
 
-def video_size(views: Views) -> int:
-    """Side length in pixels of a run's video, at most twice that of its training views."""
-    return min(VIDEO_SIZE, 2 * max(views.height, views.width))
+
+def followed(views: Views, count: int) -> tuple[list[int], Tensor]:
+    """Cameras of a video that stays where cameras were, and the time of each frame.
+
+    A camera of a rig, which shows several timesteps, stays in place while time runs from 0 to 1. If
+    all cameras differ, the video goes from one to the next in the order of their times.
+
+    Args:
+        views: Training views.
+        count: Number of frames; views repeat if there are fewer.
+
+    Returns:
+        Index of the view whose camera takes each frame, and its time from 0 to 1. [F]
+    """
+    _, place, shown = views.camera_to_world.flatten(1).unique(
+        dim=0, return_inverse=True, return_counts=True
+    )
+    if int(shown.max()) >= FEWEST_TIMES and not views.is_static:
+        index = int((place == shown.argmax()).nonzero()[0])
+        return [index] * count, torch.linspace(0, 1, count)
+    order = views.times.argsort(stable=True)
+    if not views.is_static:  # One view of each timestep.
+        order = order[views.times[order].diff(prepend=torch.tensor([-1.0])) > 0]
+    chosen = order[torch.linspace(0, len(order) - 1, count).round().long()]
+    return chosen.tolist(), views.times[chosen]
+
+
+def fitting(height: int, width: int, longest: int) -> tuple[int, int]:
+    """Rows and columns of an image whose longer side is changed to ``longest`` pixels."""
+    scale = longest / max(height, width)
+    return max(1, round(height * scale)), max(1, round(width * scale))
+
+
+@dataclass(frozen=True)
+class RunVideo:
+    """The cameras and times of a run's video: an orbit, or `followed` views.
+
+    Attributes:
+        cameras: Camera of each frame that is rendered.
+        times: Its time, from 0 to 1. [F]
+        returns: Whether the video runs through the frames again, backwards.
+    """
+
+    cameras: list[PosedCamera]
+    times: Tensor
+    returns: bool
+
+    @classmethod
+    def of(cls, scene: Scene, frame: Frame) -> "RunVideo":
+        """The video of a scene: an orbit shows an object, but not surroundings, from everywhere."""
+        views = scene.splits["train"]
+        size = min(VIDEO_SIZE, 2 * max(views.height, views.width))
+        if not scene.is_surrounded:
+            focal, poses = views.intrinsics.focal_at(size), orbit_poses(views, frame, FRAMES)
+            cameras = [PosedCamera(pose, focal, size, size) for pose in poses]
+            return cls(cameras, back_and_forth(FRAMES), False)
+        indices, times = followed(views, min(FRAMES // 2, len(views)))
+        shape = fitting(*views.size(indices[0]), size)
+        return cls([views.camera(index).resized(*shape) for index in indices], times, True)
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels that are rendered."""
+        return sum(camera.height * camera.width for camera in self.cameras)
 
 
 def back_and_forth(count: int) -> Tensor:
@@ -166,13 +230,15 @@ def back_and_forth(count: int) -> Tensor:
     return 1 - (2 * torch.arange(count) / max(count, 1) - 1).abs()
 
 
-def write_orbit(module: RadianceModule, scene: Scene, run: Path) -> Path:
-    """Write media/orbit.webp: one camera orbit while time runs from 0 to 1 and back."""
-    views, frame = scene.splits["train"], module.frame
+def write_run_video(module: RadianceModule, scene: Scene, run: Path) -> Path:
+    """Write media/video.webp, see `RunVideo`."""
+    frame = module.frame
     assert frame is not None
-    size = video_size(views)
-    focal = views.intrinsics.focal_at(size)
-    cameras = [PosedCamera(p, focal, size, size) for p in orbit_poses(views, frame, FRAMES)]
-    path = cameras, back_and_forth(FRAMES)
-    frames = render_path(module.field, module.renderer, frame, *path, background=scene.background)
-    return write_video(run / "media" / "orbit.webp", frames, fps=FPS)
+    video = RunVideo.of(scene, frame)
+    path = video.cameras, video.times
+    frames = list(
+        render_path(module.field, module.renderer, frame, *path, background=scene.background)
+    )
+    if video.returns:
+        frames += frames[-2:0:-1]
+    return write_video(run / "media" / "video.webp", frames, fps=FPS)

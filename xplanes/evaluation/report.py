@@ -14,12 +14,13 @@ from torch.utils.tensorboard.summary import hparams
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from xplanes import __version__, backend
-from xplanes.evaluation.render import FRAMES, video_size
+from xplanes.evaluation.render import RunVideo
 from xplanes.experiment import Experiment
 from xplanes.process import resume_command
 from xplanes.rendering.pictures import write_png
 from xplanes.rendering.refining import RefiningSampler
 from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
 from xplanes.training.checkpoints import LAST, training_so_far
 from xplanes.training.clock import training_seconds, training_share
@@ -99,7 +100,7 @@ def header(
         "from": module.initialisation.description,
         "samples": module.sampler.outline,
         "budget": " or ".join(limits) + ", whichever comes first" * (len(limits) > 1),
-        "estimate": estimated(experiment, data, expected, spent, done, trained),
+        "estimate": estimated(experiment, data, frame, expected, spent, done, trained),
         "changed": " ".join(overrides) or "(nothing)",
     }
     return "\n".join(f"{name:<9}{text}" for name, text in lines.items())
@@ -108,6 +109,7 @@ def header(
 def estimated(
     experiment: Experiment,
     data: SceneDataModule,
+    frame: Frame,
     expected: Estimate,
     spent: float,
     done: int = 0,
@@ -118,6 +120,7 @@ def estimated(
     Args:
         experiment: The settings.
         data: The data.
+        frame: The field's frame.
         expected: Expected durations.
         spent: Seconds so far.
         done: Steps before a resume.
@@ -140,7 +143,7 @@ def estimated(
     if final is not views or count < len(views):
         images += final.height * final.width * len(final) * expected.ray(whole)
     if experiment.media:
-        images += FRAMES * video_size(data.scene.splits["train"]) ** 2 * expected.ray(whole)
+        images += RunVideo.of(data.scene, frame).pixels * expected.ray(whole)
     parts = f"{spent:.0f} s so far, {{}} of training, {images:.0f} s of scores and images"
     if train == math.inf:
         return parts.format("no end")

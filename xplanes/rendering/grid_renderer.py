@@ -13,7 +13,7 @@ from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.behind import behind
-from xplanes.rendering.box import Field, ray_box, shade
+from xplanes.rendering.box import Field, ray_box, shade, snapshot
 from xplanes.rendering.carving import carve
 from xplanes.rendering.compositing import composite, distortion
 from xplanes.rendering.filling import fill
@@ -44,6 +44,9 @@ UNPRUNED = 0.9
 
 Nearly all of them reach the field then, which is too smooth to tell the difference.
 """
+
+SEARCHED_PER_RAY = 8
+"""Cells per ray that an image searches for empty space at most, if nothing is pruned yet."""
 
 SPARSE_POINTS = 2048
 """Points at which the sparsity prior is evaluated."""
@@ -177,6 +180,29 @@ class GridRenderer(RayRenderer):
         )
         background = behind(field, origins, directions, total[:, 3], background)
         return _pixels(total, background)
+
+    def image(
+        self,
+        field: Any,
+        origins: Tensor,
+        directions: Tensor,
+        time: float,
+        background: Tensor,
+        *,
+        chunk: int | None = None,
+    ) -> dict[str, Tensor]:
+        """As `RayRenderer.image`; finds empty space first if nothing is pruned yet.
+
+        The grid is not changed: emptying cells this early would harm training.
+        """
+        renderer, cells = self, self.grid.resolution**3
+        worthwhile = self.skip_empty and cells <= SEARCHED_PER_RAY * len(origins)
+        if worthwhile and self.grid.occupied_fraction > UNPRUNED:
+            field, grid = snapshot(field, time), self.grid.at(time)
+            grid.sweep(field, torch.Generator().manual_seed(0))
+            renderer = replace(self, grid=grid)
+        image = super(GridRenderer, renderer).image
+        return image(field, origins, directions, time, background, chunk=chunk)
 
 
 def _pixels(total: Tensor, background: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -50,7 +50,7 @@ class OccupancyGrid(nn.Module):
     ) -> None:
         super().__init__()
         self.resolution, self.time_bins = resolution, time_bins
-        self.decay = decay
+        self.step, self.threshold, self.decay = step, threshold, decay
         self.empty_density = threshold / step
         self.opaque_density = OPAQUE / step
         cells = time_bins * resolution**3
@@ -71,6 +71,15 @@ class OccupancyGrid(nn.Module):
         for axis in (2, 1, 0):
             cells = cells * self.resolution + place[:, axis]
         return cells
+
+    def at(self, time: float) -> "OccupancyGrid":
+        """A copy of the bin of a time from 0 to 1, as a grid of one bin."""
+        settings = {"step": self.step, "threshold": self.threshold, "decay": self.decay}
+        copied = OccupancyGrid(self.resolution, 1, **settings).to(self.density.device)
+        cells, place = self.resolution**3, int(self.bins(torch.tensor([time])))
+        for name, values in copied.named_buffers():
+            values.copy_(getattr(self, name)[place * cells : (place + 1) * cells])
+        return copied
 
     def allow(self, allowed: Tensor) -> None:
         """Exclude all other cells permanently. bool [time_bins, G, G, G], axes z, y, x

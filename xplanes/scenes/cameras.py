@@ -4,7 +4,7 @@ Camera axes are OpenGL's: x right, y up, looking along -z. Pixel centres lie at 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -53,6 +53,13 @@ class PosedCamera:
             centre=(0.5 * self.width, 0.5 * self.height) if self.centre is None else self.centre,
             lenses=self.lens,
         )
+
+    def resized(self, height: int, width: int) -> "PosedCamera":
+        """The same camera with an image of another size."""
+        scale = torch.tensor([width / self.width, height / self.height])
+        lens = None if self.lens is None else replace(self.lens, skew=self.lens.skew * scale[0])
+        centre = None if self.centre is None else self.centre * scale
+        return PosedCamera(self.camera_to_world, self.focal * scale, height, width, centre, lens)
 
     def to(self, device: torch.device) -> "PosedCamera":
         """Returns the camera itself: it stays on the CPU when Lightning moves a batch."""

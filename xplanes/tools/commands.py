@@ -230,13 +230,14 @@ COMMANDS = {
         {
             **RUN,
             "--path": option(
-                "orbit or fixed (square frames), view:FILE (camera and aspect ratio of a view), or "
+                "orbit or fixed (square frames), cameras (those of the training views), view:FILE "
+                "(camera and aspect ratio of a view), or "
                 "FILE.json (camera_path.json of nerfstudio, or a transforms file)",
                 "orbit",
             ),
             "--time": option(
                 "sweep, back-and-forth, own (time of view:FILE), or a number from 0 to 1; default: "
-                "back-and-forth, own for an image of view:FILE, or the times of FILE.json"
+                "back-and-forth, own for cameras and images of view:FILE, the times of FILE.json"
             ),
             "--frames": option(
                 "number of frames; default: 48, or 1 if neither camera nor time moves", type=int

@@ -19,6 +19,8 @@ from xplanes.evaluation.render import (
     IMAGES,
     back_and_forth,
     check_video,
+    fitting,
+    followed,
     orbit_poses,
     render_path,
     write_video,
@@ -42,11 +44,11 @@ class VideoOptions:
     """Options of `xplanes render`.
 
     Attributes:
-        path: Camera: ``orbit``, ``fixed`` (the first camera of the orbit), ``view:FILE``, or a
-            camera path, FILE.json.
+        path: Camera: ``orbit``, ``fixed`` (the first camera of the orbit), ``cameras`` (those of
+            the training views, see `followed`), ``view:FILE``, or a camera path, FILE.json.
         time: ``sweep`` (from 0 to 1), ``back-and-forth``, ``own`` (that of ``view:FILE``), or a
             number from 0 to 1; None for ``own`` in a single image of a view, for the times of a
-            camera path, or for back-and-forth.
+            camera path or of ``cameras``, or for back-and-forth.
         frames: Number of frames; None for 48, for 1 if neither camera nor time moves, or for one
             per camera of a camera path.
         fps: Frames per second; None for 16, or the rate in the camera path.
@@ -90,8 +92,8 @@ class VideoOptions:
             return len(self.cameras)
         if self.frames is not None:
             return self.frames
-        frozen = self.path != "orbit" and self.time not in (None, "sweep", "back-and-forth")
-        return 1 if frozen else FRAMES
+        moves = self.path in ("orbit", "cameras") or self.time in (None, "sweep", "back-and-forth")
+        return FRAMES if moves else 1
 
     @property
     def rate(self) -> int:
@@ -120,11 +122,12 @@ class VideoOptions:
         if (found := self.view(splits)) is not None:
             views, index = found
             height, width = views.size(index)
+        elif self.path == "cameras":
+            height, width = splits["train"].size(followed(splits["train"], 1)[0][0])
         elif self.cameras is not None:
             height = self.cameras.height or self.cameras.width or height
             width = self.cameras.width or height
-        scale = 1 if self.size is None else self.size / max(height, width)
-        return max(1, round(height * scale)), max(1, round(width * scale))
+        return (height, width) if self.size is None else fitting(height, width, self.size)
 
     def view(self, splits: dict[str, Views]) -> tuple[Views, int] | None:
         """The view that ``path`` names, see `find_view`; None for other kinds of cameras."""
@@ -139,7 +142,8 @@ class VideoOptions:
             parts = ["render", Path(self.path).stem, *([self.time] if self.time else [])]
         else:
             camera = self.path.replace(":", "_").replace("/", "_").removesuffix(".png")
-            parts = ["render", camera, self.time or "back-and-forth"]
+            own = "own" if self.path == "cameras" else "back-and-forth"
+            parts = ["render", camera, self.time or own]
         parts += [part for part in (self.what, checkpoint) if part not in ("colour", "last")]
         ending = ".png" if self.count == 1 else ".webp"
         return run / "media" / ("_".join(parts) + ending), False
@@ -157,9 +161,10 @@ class VideoOptions:
             times(self.time or "back-and-forth", 1)
         elif not views:
             raise ConfigError(f"--time {OWN}: is a view's own time and needs --path view:FILE")
-        if self.path not in ("orbit", "fixed") and not views and self.cameras is None:
+        if self.path not in ("orbit", "fixed", "cameras") and not views and self.cameras is None:
             raise ConfigError(
-                f"--path {self.path}: must be orbit, fixed, view:FILE or a camera path, FILE.json"
+                f"--path {self.path}: must be orbit, fixed, cameras, view:FILE or a camera path, "
+                "FILE.json"
             )
         if self.cameras is not None and self.frames is not None:
             raise ConfigError(
@@ -201,12 +206,15 @@ def render_video(trained: TrainedRun, options: VideoOptions) -> Path:
     if options.time == OWN and (found := options.view(splits)) is not None:
         views, index = found
         options = replace(options, time=str(float(views.times[index])))
+    seen_at = options.times
+    if options.path == "cameras" and options.time is None:
+        seen_at = followed(splits["train"], options.count)[1]
     frames = render_path(
         trained.module.field,
         trained.module.renderer,
         trained.frame,
         cameras(options, splits, trained.frame),
-        options.times,
+        seen_at,
         background=trained.scene.background,
         what=options.what,
         shown=pixels_with_rays(options, splits),
@@ -226,13 +234,10 @@ def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> li
         return [PosedCamera(p, f, rows, columns) for p, f in zip(path.poses, focal, strict=True)]
     if (found := options.view(splits)) is not None:
         views, index = found
-        own, intrinsics = views.camera(index), views.intrinsics
-        scale = torch.tensor([columns / own.width, rows / own.height])
-        lens = None if own.lens is None else replace(own.lens, skew=own.lens.skew * scale[0])
-        focal, centre = intrinsics.focal[index] * scale, intrinsics.centre[index] * scale
-        camera = PosedCamera(own.camera_to_world, focal, rows, columns, centre, lens)
-        return [camera] * options.count
+        return [views.camera(index).resized(rows, columns)] * options.count
     views, count = splits["train"], options.count
+    if options.path == "cameras":
+        return [views.camera(i).resized(rows, columns) for i in followed(views, count)[0]]
     poses = orbit_poses(views, frame, count if options.path == "orbit" else 1, options.elevation)
     focal = views.intrinsics.focal_at(max(rows, columns))
     return [PosedCamera(pose, focal, rows, columns) for pose in poses.expand(count, 4, 4)]

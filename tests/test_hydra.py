@@ -6,10 +6,10 @@ import re
 import shlex
 import sys
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -28,7 +28,6 @@ from xplanes.launch import prepare
 from xplanes.run import prepare as prepare_run
 from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
-from xplanes.scenes.frame import Frame
 from xplanes.training import bar
 from xplanes.training.fit import Estimate
 from xplanes.training.logs import forget_later
@@ -305,20 +304,25 @@ def test_the_estimate_counts_every_image_as_the_field_is_when_it_is_drawn(scenes
     experiment = prepare_run(small_config(scenes, *changes), tmp_path).experiment
     data = SceneDataModule(experiment.data, seed=0)
     data.setup("fit")
-    frame = Frame(1.0, torch.eye(3), torch.zeros(3))
+    module = RadianceModule(experiment.method)
+    module.build(data.scene)
     expected = Estimate(step=0.5, first_ray=5.0, later_ray=1.0, pruned_at=1000)
     assert [expected.ray(step) for step in (0, 85, 170, 999, 1000)] == [5, 3, 2, 2, 1]
     validated, tested, video = 2 * 32**2, 3 * 32**2, FRAMES * 64**2
     images = validated * (5 + 3 + 2) + 2 * (tested + video)
-    said = estimated(experiment, data, frame, expected, 7.0)
+    said = estimated(experiment, data, module, expected, 7.0)
     parts = f"7 s so far, 85 s of training, {images} s of scores and images"
     total, advice = said.split("\n")
     assert total == f"{7 + 85 + images} s in all: {parts}"
     assert "media=false" in advice
+    # Random values are not scored before the first step if there are surroundings.
+    begun = SimpleNamespace(frame=module.frame, site=replace(module.site, surrounded=True))
+    later = estimated(experiment, data, begun, expected, 7.0)  # pyright: ignore
+    assert later.startswith(f"{7 + 85 + images - 5 * validated} s in all")
     # After a resume, neither steps nor evaluations are counted again.
     images -= validated * (5 + 3)
     rest = f"{7 + 35 + images} s in all: 7 s so far, 35 s of training, {images} s of scores and"
-    assert estimated(experiment, data, frame, expected, 7.0, 100, 50.0).startswith(rest)
+    assert estimated(experiment, data, module, expected, 7.0, 100, 50.0).startswith(rest)
 
 
 def test_a_run_says_at_its_ends_what_it_takes_and_what_comes_next(scenes, tmp_path, capsys):

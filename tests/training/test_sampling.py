@@ -40,7 +40,7 @@ def along_the_diagonal() -> dict[str, torch.Tensor]:
 def test_images_of_the_trained_field_have_samples_of_their_own(sampling, monkeypatch):
     seen = sampling.renderer.render(fog, **along_the_diagonal())
     assert len(seen.samples) == STEPS_OF_A_RAY["training"]  # Nothing is pruned yet.
-    monkeypatch.setattr(grid_renderer, "UNPRUNED", 1.0)
+    monkeypatch.setattr(grid_renderer, "SMOOTH", 1.0)
     seen = sampling.renderer.render(fog, **along_the_diagonal())
     assert len(seen.samples) == STEPS_OF_A_RAY["pictures"]
     state = TrainingState(0, sampling.pruned_at, 0, 0)

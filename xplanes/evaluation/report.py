@@ -20,11 +20,10 @@ from xplanes.process import resume_command
 from xplanes.rendering.pictures import write_png
 from xplanes.rendering.refining import RefiningSampler
 from xplanes.scenes.datamodule import SceneDataModule
-from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Views
 from xplanes.training.checkpoints import LAST, training_so_far
 from xplanes.training.clock import training_seconds, training_share
-from xplanes.training.evaluation import affordable, log_image
+from xplanes.training.evaluation import affordable, log_image, scored_first
 from xplanes.training.fit import Estimate, Trainer
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, blank_psnr, mean_colour, mean_scores
@@ -100,7 +99,7 @@ def header(
         "from": module.initialisation.description,
         "samples": module.sampler.outline,
         "budget": " or ".join(limits) + ", whichever comes first" * (len(limits) > 1),
-        "estimate": estimated(experiment, data, frame, expected, spent, done, trained),
+        "estimate": estimated(experiment, data, module, expected, spent, done, trained),
         "changed": " ".join(overrides) or "(nothing)",
     }
     return "\n".join(f"{name:<9}{text}" for name, text in lines.items())
@@ -109,7 +108,7 @@ def header(
 def estimated(
     experiment: Experiment,
     data: SceneDataModule,
-    frame: Frame,
+    module: RadianceModule,
     expected: Estimate,
     spent: float,
     done: int = 0,
@@ -120,7 +119,7 @@ def estimated(
     Args:
         experiment: The settings.
         data: The data.
-        frame: The field's frame.
+        module: The module, with its field.
         expected: Expected durations.
         spent: Seconds so far.
         done: Steps before a resume.
@@ -138,12 +137,14 @@ def estimated(
     count = min(limit, len(views)) if isinstance(limit, int) else int(limit * len(views))
     pixels = views.height * views.width * count
     whole = done + train / expected.step  # Evaluations before a resume are not repeated.
-    steps_at = [share * whole for share in {*at, 1.0} if not done or share * whole > done]
+    shares = {*at, 1.0} - (set() if scored_first(module.site) else {0.0})
+    steps_at = [share * whole for share in shares if not done or share * whole > done]
     images = sum(pixels * expected.ray(step) for step in steps_at)
     if final is not views or count < len(views):
         images += final.height * final.width * len(final) * expected.ray(whole)
     if experiment.media:
-        images += RunVideo.of(data.scene, frame).pixels * expected.ray(whole)
+        assert module.frame is not None
+        images += RunVideo.of(data.scene, module.frame).pixels * expected.ray(whole)
     parts = f"{spent:.0f} s so far, {{}} of training, {images:.0f} s of scores and images"
     if train == math.inf:
         return parts.format("no end")

@@ -40,9 +40,12 @@ BINS, MOST_BINS = 8, 16
 """Usual and maximum number of time bins of the grid with time_bins=auto."""
 
 UNPRUNED = 0.9
+"""Share of occupied cells above which an image searches for empty space first."""
+
+SMOOTH = 0.4
 """Share of occupied cells above which images have no more samples than training batches.
 
-Nearly all of them reach the field then, which is too smooth to tell the difference.
+So much of a field is never sharp enough to tell the difference.
 """
 
 SEARCHED_PER_RAY = 8
@@ -385,7 +388,7 @@ class OccupancySampler(Sampler):
     @property
     def renderer(self) -> GridRenderer:
         images = self._images
-        if images.samples > self._along and self.grid.occupied_fraction > UNPRUNED:
+        if images.samples > self._along and self.grid.occupied_fraction > SMOOTH:
             return replace(images, samples=self._along)
         return images
 

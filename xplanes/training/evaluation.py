@@ -13,6 +13,7 @@ from torch import Tensor
 from xplanes.errors import ConfigError
 from xplanes.files import write_rows
 from xplanes.rendering.pictures import plane_sheet, strip, write_png
+from xplanes.rendering.sampler import Site
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Views
 from xplanes.training.clock import off_clock, training_seconds
@@ -42,6 +43,11 @@ def affordable(limit: float, views: Views) -> int | float:
     return max(LEAST_VIEWS, ROW // (views.height * views.width))
 
 
+def scored_first(site: Site) -> bool:
+    """Whether a field is scored before its first step, see `Evaluation`."""
+    return site.initialised or not site.surrounded
+
+
 class Evaluation(Callback):
     """Makes Lightning validate at given shares of the budget, and saves the results.
 
@@ -51,7 +57,8 @@ class Evaluation(Callback):
     views; checkpoints contain the rows so far.
 
     Args:
-        at: Shares of the budget, from 0 to 1; 1 is always scored.
+        at: Shares of the budget, from 0 to 1. 1 is always scored. Before the first step, random
+            values are not scored in scenes with surroundings, where their images take longest.
 
     Attributes:
         step: Step of the last evaluation; -1 before the first.
@@ -76,7 +83,9 @@ class Evaluation(Callback):
                 views = data.read_split(data.validation_split or data.test_split)
                 trainer.limit_val_batches = affordable(trainer.limit_val_batches, views)
             trainer.check_val_every_n_epoch = None
-            trainer.num_sanity_val_steps = float("inf") if 0 in self.at else 0
+            assert isinstance(pl_module, RadianceModule)
+            first = 0 in self.at and scored_first(pl_module.site)
+            trainer.num_sanity_val_steps = float("inf") if first else 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, RadianceModule)

@@ -25,6 +25,7 @@ from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.colmap import ColmapSettings
 from xplanes.scenes.colmap_model import LENSES, read_model
+from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.entries import require_precision
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses
 from xplanes.scenes.source import SceneSettings
@@ -287,6 +288,9 @@ def test_the_largest_of_several_models_is_read(capture, caplog, text):
     write_colmap(capture.path / "sparse/0", CAMERA, images[:3])
     assert len(capture.views()) == 8
     assert "sparse/1 is read, which has the most images (0 has 3, 1 has 8)" in caplog.text
+    caplog.clear()
+    SceneDataModule(capture.settings(), seed=0).setup("fit")
+    assert caplog.text.count("could not join them all") == 1
     for path in (capture.path / "sparse/1").glob("images.*"):
         path.write_bytes(b"7 damaged")
     assert len(capture.views()) == 3

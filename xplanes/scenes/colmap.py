@@ -109,14 +109,13 @@ class ColmapSettings(CaptureSettings):
     def load(self, splits: Sequence[str]) -> Scene:
         if not self.folder.is_dir():
             raise self.no_scene()
-        source = _model_folder(self.folder, self.model)
         if "test" in splits and not self.test_cameras:
-            # Checked before the model and the images are read.
+            # Checked before the model, whose choice may be reported, and the images are read.
             raise MissingSplitError(
-                f"{source} has no test split. Name the folders of some cameras in "
+                f"{self.folder} has no test split. Name the folders of some cameras in "
                 "data.test_cameras, or choose another data.eval_split."
             )
-        model = read_model(source)
+        model = read_model(_model_folder(self.folder, self.model))
         listing, folders, points = self._listing(model)
         places = self._places(listing, folders)
         scene = self.capture(listing, places, splits, model.source, points)

@@ -25,6 +25,7 @@ from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError, SceneError
 from xplanes.experiment import Experiment
 from xplanes.run import run
+from xplanes.training.evaluation import Evaluation
 from xplanes.training.fit import Trainer
 from xplanes.training.losses import loss_terms
 
@@ -193,6 +194,14 @@ class Lines(Logger):
 
     def log_hyperparams(self, params, *rest) -> None:
         pass
+
+
+def test_evaluations_join_a_fit_that_builds_the_field(config, tmp_path):
+    fit = trainer(tmp_path, max_steps=4, callbacks=[Evaluation(at=[0, 0.5])])
+    module, data = RadianceModule(config), SceneDataModule(config["data"])
+    fit.fit(module, data)
+    rows = list(csv.DictReader((tmp_path / "curve.csv").open()))
+    assert [row["step"] for row in rows] == ["0", "2", "4"]
 
 
 def test_loggers_need_no_folder(tmp_path):

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from xplanes.errors import ConfigError
-from xplanes.evaluation.render import followed, write_video
+from xplanes.evaluation.render import training_path, write_video
 from xplanes.optional import MissingExtraError
 from xplanes.rendering.pictures import to_bytes
 from xplanes.tools.render import VideoOptions, cameras, find_view, render_video, times
@@ -142,27 +142,52 @@ def test_a_video_stays_with_the_camera_of_a_rig(trained):
     views = trained.scene.splits["train"]
     poses = views.camera_to_world[[0, 1, 1, 1, 1, 0]]
     rig = replace(views.subset(range(6)), camera_to_world=poses, times=torch.arange(6) / 5)
-    indices, seen_at = followed(rig, 5)
+    indices, seen_at = training_path(rig, 5)
     assert indices == [1] * 5
     assert seen_at.tolist() == [0, 0.25, 0.5, 0.75, 1]
 
 
+def moving(views, times):
+    """Views from as many places as there are times, all by one camera."""
+    return replace(views.subset(range(len(times))), times=torch.tensor(times))
+
+
 def test_a_video_follows_a_moving_camera_at_its_times(trained):
-    views = trained.scene.splits["train"].subset(range(6))
-    moving = replace(views, times=torch.tensor([0.5, 0.0, 1.0, 0.25, 0.5, 0.75]))
-    indices, seen_at = followed(moving, 5)
-    assert indices == [1, 3, 0, 5, 2]
+    views = trained.scene.splits["train"]
+    seen = moving(views, [0.5, 0.0, 1.0, 0.25, 0.75])
+    indices, seen_at = training_path(seen, 5)
+    assert indices == [1, 3, 0, 4, 2]
     assert seen_at.tolist() == [0, 0.25, 0.5, 0.75, 1]
-    assert followed(moving, 3)[0] == [1, 0, 2]
-    still = replace(views, times=torch.zeros(6))
-    assert followed(still, 7)[0] == [0, 1, 2, 2, 3, 4, 5]
+    assert training_path(seen, 3)[0] == [1, 0, 2]
+    still = moving(views, [0.0] * 6)
+    assert training_path(still, 7)[0] == [0, 1, 2, 2, 3, 4, 5]
+    # A camera that stands still at first is no rig.
+    poses = views.camera_to_world[[0, 0, 0, 1, 2, 3, 4, 5]]
+    paused = replace(moving(views, [t / 7 for t in range(8)]), camera_to_world=poses)
+    assert training_path(paused, 8)[0] == list(range(8))
+
+
+def test_a_video_does_not_jump_between_cameras(trained):
+    views = trained.scene.splits["train"]
+    near, far = (views.camera_to_world[0].clone() for _ in range(2))
+    far[0, 3] += 3
+    poses = torch.stack([near, far] * 4)
+    poses[:, 1, 3] += torch.arange(8) / 10
+    # Two views of each timestep: from each the one beside the last.
+    pairs = replace(moving(views, [0.0, 0.0, 0.3, 0.3, 0.6, 0.6, 1.0, 1.0]), camera_to_world=poses)
+    assert training_path(pairs, 4)[0] == [0, 2, 4, 6]
+    # In turn: the camera with most views, which its focal length tells.
+    focal = pairs.intrinsics.focal * torch.tensor([1, 1.1, 1, 1.1, 1, 1.1, 1.1, 1.1])[:, None]
+    lenses = replace(pairs.intrinsics, focal=focal)
+    turns = replace(pairs, times=torch.arange(8) / 7, intrinsics=lenses)
+    assert training_path(turns, 5)[0] == [1, 3, 5, 6, 7]
 
 
 def test_cameras_of_the_training_views_are_a_path(trained):
     options = VideoOptions("cameras", frames=3, size=20)
     found = cameras(options, trained.scene.splits, trained.frame)
     views = trained.scene.splits["train"]
-    indices, _ = followed(views, 3)
+    indices, _ = training_path(views, 3)
     for camera, index in zip(found, indices, strict=True):
         own = views.camera(index)
         assert torch.equal(camera.camera_to_world, own.camera_to_world)
@@ -170,7 +195,7 @@ def test_cameras_of_the_training_views_are_a_path(trained):
         corners = [seen.rays()[1].view(seen.height, seen.width, 3) for seen in (camera, own)]
         middles = [rays.mean(dim=(0, 1)) for rays in corners]
         torch.testing.assert_close(*middles, atol=1e-3, rtol=0)
-    path = render_video(trained, options)
+    path = render_video(trained, replace(options, time="own"))
     assert path.name == "render_cameras_own.webp"
     with Image.open(path) as video:
         assert (video.n_frames, video.size) == (3, (20, 20))  # type: ignore[attr-defined]

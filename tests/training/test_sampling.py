@@ -40,7 +40,7 @@ def along_the_diagonal() -> dict[str, torch.Tensor]:
 def test_images_of_the_trained_field_have_samples_of_their_own(sampling, monkeypatch):
     seen = sampling.renderer.render(fog, **along_the_diagonal())
     assert len(seen.samples) == STEPS_OF_A_RAY["training"]  # Nothing is pruned yet.
-    monkeypatch.setattr(grid_renderer, "SMOOTH", 1.0)
+    monkeypatch.setattr(grid_renderer, "HALF_EMPTY", 1.0)
     seen = sampling.renderer.render(fog, **along_the_diagonal())
     assert len(seen.samples) == STEPS_OF_A_RAY["pictures"]
     state = TrainingState(0, sampling.pruned_at, 0, 0)
@@ -95,3 +95,25 @@ def test_images_find_empty_space_that_the_grid_has_not_pruned_yet(tmp_path):
     assert 0.5 * unsearched < searched < 0.7 * unsearched
     for name, value in sampling.grid.named_buffers():
         assert torch.equal(value, before[name]), name
+
+
+def test_images_search_for_what_is_there_at_their_time(tmp_path):
+    config = small_config(tmp_path, "model.sampler.grid_resolution=16", "model.sampler.samples=64")
+    site = Site(cube_frame(1.0, torch.zeros(3)), times=torch.rand(6), seed=0, precision="32")
+
+    def passing(points, times):
+        """A ball that crosses the cube, by a field without a snapshot."""
+        centre = torch.stack([1.4 * times - 0.7, 0 * times, 0 * times], dim=1)
+        near = (points - centre).norm(dim=1) < 0.25
+        return 0.5 + 0.5 * points, 50.0 * near
+
+    sampling = Method.read(config).model.sampler.build(passing, site)
+    grid = torch.linspace(-0.95, 0.95, 32)
+    y, x = torch.meshgrid(grid, grid, indexing="ij")
+    origins = torch.stack([x, y, torch.full_like(x, 3.0)], dim=-1).view(-1, 3)
+    rays = origins, torch.tensor([0.0, 0, -1]).expand_as(origins)
+    for time in (0.1, 0.5, 0.9):
+        found = sampling.renderer.image(passing, *rays, time, torch.ones(3))
+        times = torch.full((len(origins),), time)
+        whole = sampling.renderer.render(passing, *rays, times, torch.ones(3))
+        torch.testing.assert_close(found["opacity"], whole.opacity, atol=2e-3, rtol=0)

@@ -265,9 +265,9 @@ def test_the_video_of_a_world_is_seen_from_where_cameras_were(tmp_path):
         poses = torch.stack([camera.camera_to_world for camera in video.cameras])
         own = scene(kind).splits["train"].camera_to_world
         nearest = torch.cdist(poses.flatten(1), own.flatten(1)).amin(dim=1)
-        assert bool((nearest < 1e-6).all()) == video.returns == (kind == "world")
+        assert bool((nearest < 1e-6).all()) == video.runs_back == (kind == "world")
         assert video.pixels == len(video.cameras) * 48**2
         path = write_run_video(module, scene(kind), tmp_path / kind)
         with Image.open(path) as frames:
-            shown = 2 * len(video.cameras) - 2 if video.returns else FRAMES
+            shown = 2 * len(video.cameras) - 2 if video.runs_back else FRAMES
             assert (frames.n_frames, frames.size) == (shown, (48, 48))  # type: ignore[attr-defined]

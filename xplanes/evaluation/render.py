@@ -1,11 +1,12 @@
 """Videos along a path of cameras and times."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
@@ -38,7 +39,7 @@ def render_path(
     *,
     background: Tensor,
     what: str = "colour",
-    shown: Tensor | None = None,
+    shown: Sequence[Tensor | None] | None = None,
 ) -> Iterator[Tensor]:
     """Render frames along a path of cameras and times, one at a time.
 
@@ -50,16 +51,17 @@ def render_path(
         times: Time of each frame, from 0 to 1. [F]
         background: Colour behind the scene. [3]
         what: ``colour``, or ``depth`` as colours on the same scale in all frames.
-        shown: Mask of pixels that have a ray through the lens; the others are left empty. All
-            when None. bool [rows, columns]
+        shown: For each frame the pixels that have a ray through the lens, all if None; the others
+            are left empty. All of all frames when None. bool [rows, columns] each
 
     Yields:
         Pictures. uint8 [rows, columns, 3]
     """
-    for camera, time in zip(cameras, times.tolist(), strict=True):
+    masks = [None] * len(times) if shown is None else shown
+    for camera, time, mask in zip(cameras, times.tolist(), masks, strict=True):
         image = renderer.view(field, frame, camera, time, background)
-        if shown is not None:
-            leave_empty(image, ~shown, background)
+        if mask is not None:
+            leave_empty(image, ~mask, background)
         picture = image["colour"]
         if what == "depth":
             picture = _depth(image, float(frame.points(camera.camera_to_world[:3, 3]).norm()))
@@ -156,15 +158,19 @@ FRAMES, FPS = 48, 16
 VIDEO_SIZE = 200
 """Maximum side length in pixels of a run's video."""
 
-FEWEST_TIMES = 4
-"""Least number of timesteps that one camera shows in a video from a single camera."""
+SHOWN = 0.5
+"""Share of the timesteps that a camera must show for a video to stay with it."""
+
+FEW_CAMERAS = 4
+"""Number of calibrations up to which each is taken for a camera of its own."""
 
 
-def followed(views: Views, count: int) -> tuple[list[int], Tensor]:
-    """Cameras of a video that stays where cameras were, and the time of each frame.
+def training_path(views: Views, count: int) -> tuple[list[int], Tensor]:
+    """Cameras of a video from where training cameras were, and the time of each frame.
 
-    A camera of a rig, which shows several timesteps, stays in place while time runs from 0 to 1. If
-    all cameras differ, the video goes from one to the next in the order of their times.
+    A camera of a rig, which shows most timesteps, stays in place while time runs from 0 to 1.
+    Otherwise the video follows one moving camera: from view to view in the order of their times,
+    from each timestep the nearest.
 
     Args:
         views: Training views.
@@ -173,17 +179,49 @@ def followed(views: Views, count: int) -> tuple[list[int], Tensor]:
     Returns:
         Index of the view whose camera takes each frame, and its time from 0 to 1. [F]
     """
-    _, place, shown = views.camera_to_world.flatten(1).unique(
-        dim=0, return_inverse=True, return_counts=True
-    )
-    if int(shown.max()) >= FEWEST_TIMES and not views.is_static:
-        index = int((place == shown.argmax()).nonzero()[0])
+    poses, place = views.camera_to_world.flatten(1).unique(dim=0, return_inverse=True)
+    timesteps = len(views.times.unique())
+    shown = [len(views.times[place == pose].unique()) for pose in range(len(poses))]
+    if not views.is_static and max(shown) >= max(2, SHOWN * timesteps):
+        index = int((place == shown.index(max(shown))).nonzero()[0])
         return [index] * count, torch.linspace(0, 1, count)
-    order = views.times.argsort(stable=True)
-    if not views.is_static:  # One view of each timestep.
-        order = order[views.times[order].diff(prepend=torch.tensor([-1.0])) > 0]
+    order = _one_camera(views)
+    order = order[views.times[order].argsort(stable=True)]
+    if not views.is_static:
+        order = _nearest_of_each_timestep(views, order)
     chosen = order[torch.linspace(0, len(order) - 1, count).round().long()]
     return chosen.tolist(), views.times[chosen]
+
+
+def _one_camera(views: Views) -> Tensor:
+    """Views of the most common image size, and calibration if there are few. int64 [N]"""
+    known = views.intrinsics
+    sizes = known.size.unique(dim=0, return_inverse=True)[1]
+    kept = (sizes == sizes.mode().values).nonzero()[:, 0]
+    numbers = torch.cat([known.focal, known.centre], dim=1)[kept]
+    different, cameras = numbers.unique(dim=0, return_inverse=True)
+    return kept[cameras == cameras.mode().values] if len(different) <= FEW_CAMERAS else kept
+
+
+def _nearest_of_each_timestep(views: Views, order: Tensor) -> Tensor:
+    """One view of each timestep, the nearest to the one before. int64 [N] -> [T]"""
+    positions, found = views.camera_to_world[:, :3, 3], order[:1]
+    for same in order.split(views.times[order].unique_consecutive(return_counts=True)[1].tolist()):
+        distances = (positions[same] - positions[found[-1]]).norm(dim=1)
+        found = torch.cat([found, same[distances.argmin()][None]])
+    return found[1:]
+
+
+def pixels_with_rays(views: Views, index: int, height: int, width: int) -> Tensor | None:
+    """Pixels of an image of another size for which a view's lens has rays; None for all.
+
+    Returns:
+        bool [height, width]
+    """
+    if (known := views.intrinsics.has_ray(index)) is None:
+        return None
+    size = height, width
+    return F.interpolate(known[None, None].float(), size, mode="nearest-exact")[0, 0] > 0
 
 
 def fitting(height: int, width: int, longest: int) -> tuple[int, int]:
@@ -194,17 +232,20 @@ def fitting(height: int, width: int, longest: int) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class RunVideo:
-    """The cameras and times of a run's video: an orbit, or `followed` views.
+    """The cameras and times of a run's video: an orbit, or a `training_path`.
 
     Attributes:
         cameras: Camera of each frame that is rendered.
         times: Its time, from 0 to 1. [F]
-        returns: Whether the video runs through the frames again, backwards.
+        runs_back: Whether the video runs through the frames again, backwards.
+        shown: For each frame the pixels that have a ray through the lens, all if None; None if all
+            frames show all pixels. bool [rows, columns] each
     """
 
     cameras: list[PosedCamera]
     times: Tensor
-    returns: bool
+    runs_back: bool
+    shown: list[Tensor | None] | None = None
 
     @classmethod
     def of(cls, scene: Scene, frame: Frame) -> "RunVideo":
@@ -215,9 +256,11 @@ class RunVideo:
             focal, poses = views.intrinsics.focal_at(size), orbit_poses(views, frame, FRAMES)
             cameras = [PosedCamera(pose, focal, size, size) for pose in poses]
             return cls(cameras, back_and_forth(FRAMES), False)
-        indices, times = followed(views, min(FRAMES // 2, len(views)))
+        indices, times = training_path(views, min(FRAMES // 2, len(views)))
         shape = fitting(*views.size(indices[0]), size)
-        return cls([views.camera(index).resized(*shape) for index in indices], times, True)
+        cameras = [views.camera(index).resized(*shape) for index in indices]
+        shown = [pixels_with_rays(views, index, *shape) for index in indices]
+        return cls(cameras, times, True, shown)
 
     @property
     def pixels(self) -> int:
@@ -235,10 +278,9 @@ def write_run_video(module: RadianceModule, scene: Scene, run: Path) -> Path:
     frame = module.frame
     assert frame is not None
     video = RunVideo.of(scene, frame)
-    path = video.cameras, video.times
-    frames = list(
-        render_path(module.field, module.renderer, frame, *path, background=scene.background)
-    )
-    if video.returns:
+    path, shown = (video.cameras, video.times), video.shown
+    options = {"background": scene.background, "shown": shown}
+    frames = list(render_path(module.field, module.renderer, frame, *path, **options))
+    if video.runs_back:
         frames += frames[-2:0:-1]
     return write_video(run / "media" / "video.webp", frames, fps=FPS)

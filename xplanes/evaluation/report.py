@@ -23,7 +23,7 @@ from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Views
 from xplanes.training.checkpoints import LAST, training_so_far
 from xplanes.training.clock import training_seconds, training_share
-from xplanes.training.evaluation import affordable, log_image, scored_first
+from xplanes.training.evaluation import affordable, log_image, scored_before_training
 from xplanes.training.fit import Estimate, Trainer
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, blank_psnr, mean_colour, mean_scores
@@ -137,7 +137,7 @@ def estimated(
     count = min(limit, len(views)) if isinstance(limit, int) else int(limit * len(views))
     pixels = views.height * views.width * count
     whole = done + train / expected.step  # Evaluations before a resume are not repeated.
-    shares = {*at, 1.0} - (set() if scored_first(module.site) else {0.0})
+    shares = {*at, 1.0} - (set() if scored_before_training(module.site) else {0.0})
     steps_at = [share * whole for share in shares if not done or share * whole > done]
     images = sum(pixels * expected.ray(step) for step in steps_at)
     if final is not views or count < len(views):

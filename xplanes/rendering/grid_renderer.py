@@ -3,6 +3,7 @@
 import math
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Any, Literal, cast
 
 import torch
@@ -42,10 +43,10 @@ BINS, MOST_BINS = 8, 16
 UNPRUNED = 0.9
 """Share of occupied cells above which an image searches for empty space first."""
 
-SMOOTH = 0.4
+HALF_EMPTY = 0.4
 """Share of occupied cells above which images have no more samples than training batches.
 
-So much of a field is never sharp enough to tell the difference.
+A field that fills so much of the cube is too smooth to show a difference.
 """
 
 SEARCHED_PER_RAY = 8
@@ -202,10 +203,15 @@ class GridRenderer(RayRenderer):
         worthwhile = self.skip_empty and cells <= SEARCHED_PER_RAY * len(origins)
         if worthwhile and self.grid.occupied_fraction > UNPRUNED:
             field, grid = snapshot(field, time), self.grid.at(time)
-            grid.sweep(field, torch.Generator().manual_seed(0))
+            now = partial(_at_time, field, time)
+            grid.sweep(now, torch.Generator().manual_seed(0))
             renderer = replace(self, grid=grid)
         image = super(GridRenderer, renderer).image
         return image(field, origins, directions, time, background, chunk=chunk)
+
+
+def _at_time(field: Any, time: float, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+    return field(points, torch.full_like(times, time))
 
 
 def _pixels(total: Tensor, background: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -225,7 +231,9 @@ class OccupancySettings(SamplerSettings):
     # Samples along the diagonal of the cube in training. auto: half the number of image pixels
     # along its side, from 128 to 256; 128 in scenes with surroundings.
     samples: Count | Literal["auto"]
-    render_samples: Count  # Samples along the diagonal in evaluation and videos.
+    # Samples along the diagonal in evaluation and videos; as in training while two fifths of the
+    # cells are occupied.
+    render_samples: Count
     grid_resolution: Count  # Cells of the occupancy grid along each side.
     # Bins of the occupancy grid along time. auto: 8; one per timestep, up to 16, if four or more
     # views show each.
@@ -388,7 +396,7 @@ class OccupancySampler(Sampler):
     @property
     def renderer(self) -> GridRenderer:
         images = self._images
-        if images.samples > self._along and self.grid.occupied_fraction > SMOOTH:
+        if images.samples > self._along and self.grid.occupied_fraction > HALF_EMPTY:
             return replace(images, samples=self._along)
         return images
 

@@ -163,7 +163,8 @@ def model_card(run: Path, repository: str) -> str:
         eval_results=results,
     )
     table = "".join(f"| {name} | {value:.4g} |\n" for name, value in scores.items())
-    picture = "![Video](media/video.webp)\n\n" if (run / "media" / "video.webp").is_file() else ""
+    video = metrics.get("media")
+    picture = f"![Video]({video})\n\n" if video and (run / video).is_file() else ""
     overrides = shlex.join((run / "overrides.txt").read_text(encoding="utf-8").splitlines())
     return f"""---
 {card.to_yaml()}

@@ -7,7 +7,6 @@ from functools import cached_property
 from pathlib import Path
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from tqdm import tqdm
 
@@ -20,9 +19,10 @@ from xplanes.evaluation.render import (
     back_and_forth,
     check_video,
     fitting,
-    followed,
     orbit_poses,
+    pixels_with_rays,
     render_path,
+    training_path,
     write_video,
 )
 from xplanes.files import require_writable
@@ -45,12 +45,12 @@ class VideoOptions:
 
     Attributes:
         path: Camera: ``orbit``, ``fixed`` (the first camera of the orbit), ``cameras`` (those of
-            the training views, see `followed`), ``view:FILE``, or a camera path, FILE.json.
+            the training views, see `training_path`), ``view:FILE``, or a camera path, FILE.json.
         time: ``sweep`` (from 0 to 1), ``back-and-forth``, ``own`` (that of ``view:FILE``), or a
             number from 0 to 1; None for ``own`` in a single image of a view, for the times of a
             camera path or of ``cameras``, or for back-and-forth.
-        frames: Number of frames; None for 48, for 1 if neither camera nor time moves, or for one
-            per camera of a camera path.
+        frames: Number of frames; None for 48, for 1 if a fixed camera or a view shows one time, or
+            for one per camera of a camera path.
         fps: Frames per second; None for 16, or the rate in the camera path.
         size: Pixels of the longer side; None for the size of the training views, of the view that
             ``path`` names, or the size in the camera path. Frames of an orbit or a fixed camera
@@ -123,7 +123,7 @@ class VideoOptions:
             views, index = found
             height, width = views.size(index)
         elif self.path == "cameras":
-            height, width = splits["train"].size(followed(splits["train"], 1)[0][0])
+            height, width = splits["train"].size(training_path(splits["train"], 1)[0][0])
         elif self.cameras is not None:
             height = self.cameras.height or self.cameras.width or height
             width = self.cameras.width or height
@@ -159,8 +159,10 @@ class VideoOptions:
         views = self.path.startswith("view:")
         if self.time != OWN:
             times(self.time or "back-and-forth", 1)
-        elif not views:
-            raise ConfigError(f"--time {OWN}: is a view's own time and needs --path view:FILE")
+        elif not views and self.path != "cameras":
+            raise ConfigError(
+                f"--time {OWN}: is a view's own time and needs --path view:FILE or cameras"
+            )
         if self.path not in ("orbit", "fixed", "cameras") and not views and self.cameras is None:
             raise ConfigError(
                 f"--path {self.path}: must be orbit, fixed, cameras, view:FILE or a camera path, "
@@ -206,9 +208,8 @@ def render_video(trained: TrainedRun, options: VideoOptions) -> Path:
     if options.time == OWN and (found := options.view(splits)) is not None:
         views, index = found
         options = replace(options, time=str(float(views.times[index])))
-    seen_at = options.times
-    if options.path == "cameras" and options.time is None:
-        seen_at = followed(splits["train"], options.count)[1]
+    own = options.path == "cameras" and options.time in (None, OWN)
+    seen_at = training_path(splits["train"], options.count)[1] if own else options.times
     frames = render_path(
         trained.module.field,
         trained.module.renderer,
@@ -217,7 +218,7 @@ def render_video(trained: TrainedRun, options: VideoOptions) -> Path:
         seen_at,
         background=trained.scene.background,
         what=options.what,
-        shown=pixels_with_rays(options, splits),
+        shown=shown_pixels(options, splits),
     )
     counted = tqdm(frames, "frames", options.count, leave=False, delay=2, disable=None)
     return write_video(target, counted, fps=options.rate, folder=folder)
@@ -237,21 +238,22 @@ def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> li
         return [views.camera(index).resized(rows, columns)] * options.count
     views, count = splits["train"], options.count
     if options.path == "cameras":
-        return [views.camera(i).resized(rows, columns) for i in followed(views, count)[0]]
+        return [views.camera(i).resized(rows, columns) for i in training_path(views, count)[0]]
     poses = orbit_poses(views, frame, count if options.path == "orbit" else 1, options.elevation)
     focal = views.intrinsics.focal_at(max(rows, columns))
     return [PosedCamera(pose, focal, rows, columns) for pose in poses.expand(count, 4, 4)]
 
 
-def pixels_with_rays(options: VideoOptions, splits: dict[str, Views]) -> Tensor | None:
-    """Pixels of a frame for which its lens has rays; None for all. bool [rows, columns]"""
-    if (found := options.view(splits)) is None:
+def shown_pixels(options: VideoOptions, splits: dict[str, Views]) -> list[Tensor | None] | None:
+    """Pixels of each frame for which its lens has rays, see `render_path`."""
+    shape = options.shape(splits)
+    if (found := options.view(splits)) is not None:
+        return [pixels_with_rays(*found, *shape)] * options.count
+    if options.path != "cameras":
         return None
-    views, index = found
-    if (known := views.intrinsics.has_ray(index)) is None:
-        return None
-    size = options.shape(splits)
-    return F.interpolate(known[None, None].float(), size, mode="nearest-exact")[0, 0] > 0
+    views = splits["train"]
+    indices, _ = training_path(views, options.count)
+    return [pixels_with_rays(views, index, *shape) for index in indices]
 
 
 def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:

@@ -43,7 +43,7 @@ def affordable(limit: float, views: Views) -> int | float:
     return max(LEAST_VIEWS, ROW // (views.height * views.width))
 
 
-def scored_first(site: Site) -> bool:
+def scored_before_training(site: Site) -> bool:
     """Whether a field is scored before its first step, see `Evaluation`."""
     return site.initialised or not site.surrounded
 
@@ -83,9 +83,11 @@ class Evaluation(Callback):
                 views = data.read_split(data.validation_split or data.test_split)
                 trainer.limit_val_batches = affordable(trainer.limit_val_batches, views)
             trainer.check_val_every_n_epoch = None
-            assert isinstance(pl_module, RadianceModule)
-            first = 0 in self.at and scored_first(pl_module.site)
-            trainer.num_sanity_val_steps = float("inf") if first else 0
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, RadianceModule)
+        first = 0 in self.at and scored_before_training(pl_module.site)
+        trainer.num_sanity_val_steps = float("inf") if first else 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, RadianceModule)

@@ -3,6 +3,7 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -181,6 +182,16 @@ def test_a_video_does_not_jump_between_cameras(trained):
     lenses = replace(pairs.intrinsics, focal=focal)
     turns = replace(pairs, times=torch.arange(8) / 7, intrinsics=lenses)
     assert training_path(turns, 5)[0] == [1, 3, 5, 6, 7]
+
+
+def test_a_video_of_surroundings_stays_with_the_cameras_by_default(trained):
+    alone, inside = (SimpleNamespace(is_surrounded=seen) for seen in (False, True))
+    chosen = [
+        options.chosen_for(scene).path  # pyright: ignore
+        for options in (VideoOptions(), VideoOptions(elevation=50), VideoOptions("fixed"))
+        for scene in (alone, inside)
+    ]
+    assert chosen == ["orbit", "cameras", "orbit", "orbit", "fixed", "fixed"]
 
 
 def test_cameras_of_the_training_views_are_a_path(trained):

@@ -113,9 +113,11 @@ def _render(options: argparse.Namespace) -> None:
     wanted = _filled(VideoOptions, options)
     wanted.check()
     trained = _load(options)
+    wanted = wanted.chosen_for(trained.scene)
     height, width = wanted.shape(trained.scene.splits)
     written = "as in the file" if wanted.cameras is not None else "back-and-forth"
-    camera = f"{options.path} camera, time {wanted.time or written}"
+    written = "their own" if wanted.path == "cameras" else written
+    camera = f"{wanted.path} camera, time {wanted.time or written}"
     say(f"frames      {wanted.count} of {width}x{height} px, {options.what}, {camera}\n")
     say(f"wrote {render_video(trained, wanted)}")
 
@@ -230,10 +232,10 @@ COMMANDS = {
         {
             **RUN,
             "--path": option(
-                "orbit or fixed (square frames), cameras (those of the training views), view:FILE "
-                "(camera and aspect ratio of a view), or "
-                "FILE.json (camera_path.json of nerfstudio, or a transforms file)",
-                "orbit",
+                "orbit or fixed (square frames), cameras (where training cameras were), view:FILE "
+                "(camera and aspect ratio of a view), FILE.json (camera_path.json of nerfstudio or "
+                "a transforms file) or auto: cameras in scenes with surroundings, else orbit",
+                "auto",
             ),
             "--time": option(
                 "sweep, back-and-forth, own (time of view:FILE), or a number from 0 to 1; default: "

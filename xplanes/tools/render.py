@@ -28,12 +28,15 @@ from xplanes.evaluation.render import (
 from xplanes.files import require_writable
 from xplanes.scenes.cameras import PosedCamera
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import Views
+from xplanes.scenes.views import Scene, Views
 from xplanes.tools.camera_path import CameraPath, read_camera_path
 from xplanes.tools.runs import TrainedRun
 
 OWN = "own"
 """Value of ``--time`` for the time of the view that ``--path`` names."""
+
+PATHS = ("auto", "orbit", "fixed", "cameras")
+"""Values of ``--path`` that are no names of views or files."""
 
 LARGEST = 8192
 """Most pixels per side; WebP allows twice as many."""
@@ -45,7 +48,8 @@ class VideoOptions:
 
     Attributes:
         path: Camera: ``orbit``, ``fixed`` (the first camera of the orbit), ``cameras`` (those of
-            the training views, see `training_path`), ``view:FILE``, or a camera path, FILE.json.
+            the training views, see `training_path`), ``view:FILE``, a camera path, FILE.json, or
+            ``auto``, see `chosen_for`.
         time: ``sweep`` (from 0 to 1), ``back-and-forth``, ``own`` (that of ``view:FILE``), or a
             number from 0 to 1; None for ``own`` in a single image of a view, for the times of a
             camera path or of ``cameras``, or for back-and-forth.
@@ -61,7 +65,7 @@ class VideoOptions:
             run's media/ that is named after the options.
     """
 
-    path: str = "orbit"
+    path: str = "auto"
     time: str | None = None
     frames: int | None = None
     fps: int | None = None
@@ -75,6 +79,13 @@ class VideoOptions:
         one_image = out.suffix in IMAGES and not out.is_dir() and self.frames in (None, 1)
         if one_image and self.path.startswith("view:") and self.time is None:
             object.__setattr__(self, "time", OWN)
+
+    def chosen_for(self, scene: Scene) -> "VideoOptions":
+        """The options with a path: by default an orbit, or cameras in a scene with surroundings."""
+        if self.path != "auto":
+            return self
+        stays = scene.is_surrounded and self.elevation == ELEVATION
+        return replace(self, path="cameras" if stays else "orbit")
 
     @cached_property
     def cameras(self) -> CameraPath | None:
@@ -92,8 +103,9 @@ class VideoOptions:
             return len(self.cameras)
         if self.frames is not None:
             return self.frames
-        moves = self.path in ("orbit", "cameras") or self.time in (None, "sweep", "back-and-forth")
-        return FRAMES if moves else 1
+        moves = self.path in PATHS and self.path != "fixed"
+        passes = self.time in (None, "sweep", "back-and-forth")
+        return FRAMES if moves or passes else 1
 
     @property
     def rate(self) -> int:
@@ -163,10 +175,10 @@ class VideoOptions:
             raise ConfigError(
                 f"--time {OWN}: is a view's own time and needs --path view:FILE or cameras"
             )
-        if self.path not in ("orbit", "fixed", "cameras") and not views and self.cameras is None:
+        if self.path not in PATHS and not views and self.cameras is None:
             raise ConfigError(
-                f"--path {self.path}: must be orbit, fixed, cameras, view:FILE or a camera path, "
-                "FILE.json"
+                f"--path {self.path}: must be auto, orbit, fixed, cameras, view:FILE or a camera "
+                "path, FILE.json"
             )
         if self.cameras is not None and self.frames is not None:
             raise ConfigError(
@@ -202,6 +214,7 @@ def render_video(trained: TrainedRun, options: VideoOptions) -> Path:
         ImportError: For .mp4 without the extra ``video``.
     """
     options.check()
+    options = options.chosen_for(trained.scene)
     target, folder = options.destination(trained.path, trained.checkpoint)
     require_writable(target.parent)
     splits = trained.scene.splits
@@ -239,7 +252,7 @@ def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> li
     views, count = splits["train"], options.count
     if options.path == "cameras":
         return [views.camera(i).resized(rows, columns) for i in training_path(views, count)[0]]
-    poses = orbit_poses(views, frame, count if options.path == "orbit" else 1, options.elevation)
+    poses = orbit_poses(views, frame, 1 if options.path == "fixed" else count, options.elevation)
     focal = views.intrinsics.focal_at(max(rows, columns))
     return [PosedCamera(pose, focal, rows, columns) for pose in poses.expand(count, 4, 4)]
 

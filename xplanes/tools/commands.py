@@ -117,7 +117,8 @@ def _render(options: argparse.Namespace) -> None:
     height, width = wanted.shape(trained.scene.splits)
     written = "as in the file" if wanted.cameras is not None else "back-and-forth"
     written = "their own" if wanted.path == "cameras" else written
-    camera = f"{wanted.path} camera, time {wanted.time or written}"
+    name = "training cameras" if wanted.path == "cameras" else f"{wanted.path} camera"
+    camera = f"{name}, time {wanted.time or written}"
     say(f"frames      {wanted.count} of {width}x{height} px, {options.what}, {camera}\n")
     say(f"wrote {render_video(trained, wanted)}")
 

@@ -137,8 +137,7 @@ def scenes() -> list[Case]:
         found.append(replace(case, quick="topology" in scene))
         others = {} if scene in DISTORTED else {"4D-GS": GAUSSIANS}
         if "suite" not in given[0]:
-            # Its own cube, of half side 1.3, is that of the D-NeRF scenes.
-            others |= {"K-Planes, smaller": (*KPLANES, "model.half_side=null")}
+            others |= {"K-Planes, smaller": KPLANES}
         if scene in BOXED:
             others |= {"TiNeuVox-S": TINEUVOX}
         for method, options in others.items():

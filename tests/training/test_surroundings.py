@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -14,6 +15,7 @@ from tests.baselines.runs import KPLANES, PROPOSAL, TINEUVOX
 from tests.training.runs import same_state, small_config, train_quietly
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.baselines.proposal import spaced, unspaced
+from xplanes.evaluation import render
 from xplanes.evaluation.render import FRAMES, RunVideo, write_run_video
 from xplanes.rendering.behind import background_colour
 from xplanes.scenes.views import Scene
@@ -265,9 +267,19 @@ def test_the_video_of_a_world_is_seen_from_where_cameras_were(tmp_path):
         poses = torch.stack([camera.camera_to_world for camera in video.cameras])
         own = scene(kind).splits["train"].camera_to_world
         nearest = torch.cdist(poses.flatten(1), own.flatten(1)).amin(dim=1)
-        assert bool((nearest < 1e-6).all()) == video.runs_back == (kind == "world")
+        assert bool((nearest < 1e-6).all()) == bool(video.path) == (kind == "world")
         assert video.pixels == len(video.cameras) * 48**2
         path = write_run_video(module, scene(kind), tmp_path / kind)
         with Image.open(path) as frames:
-            shown = 2 * len(video.cameras) - 2 if video.runs_back else FRAMES
+            shown = 2 * len(video.cameras) - 2 if video.path else FRAMES
             assert (frames.n_frames, frames.size) == (shown, (48, 48))  # type: ignore[attr-defined]
+
+
+def test_pixels_of_the_video_without_a_ray_are_left_empty(tmp_path, monkeypatch):
+    shown = torch.arange(48).expand(48, 48) < 24
+    monkeypatch.setattr(render, "pixels_with_rays", lambda *_: shown)
+    path = write_run_video(built("world"), scene("world"), tmp_path)
+    with Image.open(path) as video:
+        frame = np.asarray(video.convert("RGB")).astype(float) / 255
+    assert frame[:, 30:].min() > 0.97  # White, but for compression.
+    assert frame[:, :18].mean() < 0.9

@@ -232,20 +232,17 @@ def fitting(height: int, width: int, longest: int) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class RunVideo:
-    """The cameras and times of a run's video: an orbit, or a `training_path`.
+    """The cameras and times of a run's video: an orbit, or a `training_path` and back.
 
     Attributes:
         cameras: Camera of each frame that is rendered.
         times: Its time, from 0 to 1. [F]
-        runs_back: Whether the video runs through the frames again, backwards.
-        shown: For each frame the pixels that have a ray through the lens, all if None; None if all
-            frames show all pixels. bool [rows, columns] each
+        path: Index of the training view of each camera; empty for an orbit.
     """
 
     cameras: list[PosedCamera]
     times: Tensor
-    runs_back: bool
-    shown: list[Tensor | None] | None = None
+    path: list[int]
 
     @classmethod
     def of(cls, scene: Scene, frame: Frame) -> "RunVideo":
@@ -255,12 +252,10 @@ class RunVideo:
         if not scene.is_surrounded:
             focal, poses = views.intrinsics.focal_at(size), orbit_poses(views, frame, FRAMES)
             cameras = [PosedCamera(pose, focal, size, size) for pose in poses]
-            return cls(cameras, back_and_forth(FRAMES), False)
-        indices, times = training_path(views, min(FRAMES // 2, len(views)))
-        shape = fitting(*views.size(indices[0]), size)
-        cameras = [views.camera(index).resized(*shape) for index in indices]
-        shown = [pixels_with_rays(views, index, *shape) for index in indices]
-        return cls(cameras, times, True, shown)
+            return cls(cameras, back_and_forth(FRAMES), [])
+        path, times = training_path(views, min(FRAMES // 2, len(views)))
+        shape = fitting(*views.size(path[0]), size)
+        return cls([views.camera(index).resized(*shape) for index in path], times, path)
 
     @property
     def pixels(self) -> int:
@@ -275,12 +270,14 @@ def back_and_forth(count: int) -> Tensor:
 
 def write_run_video(module: RadianceModule, scene: Scene, run: Path) -> Path:
     """Write media/video.webp, see `RunVideo`."""
-    frame = module.frame
+    frame, views = module.frame, scene.splits["train"]
     assert frame is not None
     video = RunVideo.of(scene, frame)
-    path, shown = (video.cameras, video.times), video.shown
-    options = {"background": scene.background, "shown": shown}
+    first = video.cameras[0]
+    shown = [pixels_with_rays(views, index, first.height, first.width) for index in video.path]
+    options = {"background": scene.background, "shown": shown or None}
+    path = video.cameras, video.times
     frames = list(render_path(module.field, module.renderer, frame, *path, **options))
-    if video.runs_back:
+    if video.path:
         frames += frames[-2:0:-1]
     return write_video(run / "media" / "video.webp", frames, fps=FPS)

@@ -210,7 +210,7 @@ class XPlanesSettings(ModelSettings):
         return XPlanesModel(self, self.build_field(site, initial), site, initial)
 
     def build_field(self, site: Site, initial: InitialValues | None = None) -> XPlanes:
-        """Build planes and decoder from the initial values, if given, otherwise at random."""
+        """Build planes and decoder from the initial values, if given, otherwise randomly."""
         plane_set = self.plane_set if site.moves else "three"
         background = None if self.background is None else self.background.build(site)
         generator = step_generator(site.seed, 0, Stream.INITIAL_FIELD)

@@ -126,6 +126,16 @@ class RayRenderer(Renderer):
         seen = self.render(field, origins, directions, times, background)
         return seen.colour, seen.opacity, seen.depth
 
+    def for_image(self, field: Any, time: float, rays: int) -> "RayRenderer":
+        """The renderer of an image, of the same kind; itself by default.
+
+        Args:
+            field: The field, or its snapshot at that time.
+            time: Time of the image, from 0 to 1.
+            rays: Number of its rays.
+        """
+        return self
+
     @torch.no_grad()
     def image(
         self,
@@ -143,10 +153,11 @@ class RayRenderer(Renderer):
             ``colour`` [R, 3], ``opacity`` [R] and ``depth`` [R], on the rays' device.
         """
         field, parts = snapshot(field, time), []
+        renderer = self.for_image(field, time, len(origins))
         chunk = chunk or self.rays_at_once * (1 if self.device.type == "cpu" else 2)
         for start in range(0, max(len(origins), 1), chunk):
             rays = origins[start : start + chunk], directions[start : start + chunk]
             times = torch.full_like(rays[0][:, 0], time)
-            parts.append(self.pixels(field, *rays, times, background))
+            parts.append(renderer.pixels(field, *rays, times, background))
         colour, opacity, depth = (torch.cat(part) for part in zip(*parts, strict=True))
         return {"colour": colour, "opacity": opacity, "depth": depth}

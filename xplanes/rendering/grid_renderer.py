@@ -3,7 +3,6 @@
 import math
 import time
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Annotated, Any, Literal, cast
 
 import torch
@@ -14,7 +13,7 @@ from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.behind import behind
-from xplanes.rendering.box import Field, ray_box, shade, snapshot
+from xplanes.rendering.box import Field, ray_box, shade
 from xplanes.rendering.carving import carve
 from xplanes.rendering.compositing import composite, distortion
 from xplanes.rendering.filling import fill
@@ -185,33 +184,21 @@ class GridRenderer(RayRenderer):
         background = behind(field, origins, directions, total[:, 3], background)
         return _pixels(total, background)
 
-    def image(
-        self,
-        field: Any,
-        origins: Tensor,
-        directions: Tensor,
-        time: float,
-        background: Tensor,
-        *,
-        chunk: int | None = None,
-    ) -> dict[str, Tensor]:
-        """As `RayRenderer.image`; finds empty space first if nothing is pruned yet.
+    def for_image(self, field: Any, time: float, rays: int) -> "GridRenderer":
+        """As `RayRenderer.for_image`; finds empty space first if nothing is pruned yet.
 
         The grid is not changed: emptying cells this early would harm training.
         """
-        renderer, cells = self, self.grid.resolution**3
-        worthwhile = self.skip_empty and cells <= SEARCHED_PER_RAY * len(origins)
-        if worthwhile and self.grid.occupied_fraction > UNPRUNED:
-            field, grid = snapshot(field, time), self.grid.at(time)
-            now = partial(_at_time, field, time)
-            grid.sweep(now, torch.Generator().manual_seed(0))
-            renderer = replace(self, grid=grid)
-        image = super(GridRenderer, renderer).image
-        return image(field, origins, directions, time, background, chunk=chunk)
+        worthwhile = self.skip_empty and self.grid.resolution**3 <= SEARCHED_PER_RAY * rays
+        if not worthwhile or self.grid.occupied_fraction <= UNPRUNED:
+            return self
+        grid = self.grid.at(time)
 
+        def now(points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+            return field(points, torch.full_like(times, time))
 
-def _at_time(field: Any, time: float, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
-    return field(points, torch.full_like(times, time))
+        grid.sweep(now, torch.Generator().manual_seed(0))
+        return replace(self, grid=grid)
 
 
 def _pixels(total: Tensor, background: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -17,9 +17,11 @@ from xplanes.rendering.refining import CameraCorrections, rotations, without_com
 from xplanes.run import run
 from xplanes.scenes.batches import RayBatches, ViewBatches, ViewSettings
 from xplanes.scenes.cameras import project
-from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.scenes.datamodule import SceneDataModule, whole_view
 from xplanes.scenes.frame import CameraGroups, cube_frame
 from xplanes.scenes.views import Views
+from xplanes.tools.runs import load_run
+from xplanes.training.scores import score_view
 
 SIZE, FOCAL, RADIUS = 64, 80.0, 0.8
 FRAME = cube_frame(1.25, torch.tensor([0.1, 0.0, -0.1]))
@@ -102,7 +104,7 @@ def refined(views, rounds=12):
     batches = batches_of(views)
     cameras = CameraCorrections(CameraGroups.of(views, FRAME))
     for step in range(8 * rounds):
-        rays = cameras.corrected(batches.draw(step))
+        rays = cameras.corrected_rays(batches.draw(step))
         colour, opacity, depth = ball(rays["origins"], rays["directions"])
         seen = Rendering(colour, opacity, depth, torch.empty(0), None)  # pyright: ignore
         cameras.observe(rays, seen)
@@ -120,18 +122,23 @@ def test_cameras_return_to_where_they_stood(monkeypatch):
     wrong = disturbed(truth, 2.5)
     before = apart(wrong, truth)
     cameras = refined(replace(views, camera_to_world=wrong))
-    after = apart(cameras.poses(wrong, FRAME), truth)
+    after = apart(cameras.corrected(wrong, FRAME), truth)
     assert before.mean() > 1.5
     assert after.max() < 0.1
     # The poses in the world are those whose rays were cast.
-    found = replace(views, camera_to_world=cameras.poses(wrong, FRAME))
+    found = replace(views, camera_to_world=cameras.corrected(wrong, FRAME))
     rays = batches_of(replace(views, camera_to_world=wrong)).draw(0)
     expected = batches_of(found).draw(0)
-    corrected = cameras.corrected(rays)
+    corrected = cameras.corrected_rays(rays)
     for name in ("origins", "directions", "across"):
         assert torch.allclose(corrected[name], expected[name], atol=2e-6), name
+    # Held-out frames of these cameras share their corrections; other cameras are left alone.
+    both = torch.stack([truth[0], wrong[3]])
+    assert torch.equal(
+        cameras.corrected(both, FRAME), torch.stack([truth[0], found.camera_to_world[3]])
+    )
     # What they are said to have moved is what is seen of the ball.
-    moved = apart(cameras.poses(wrong, FRAME), wrong)
+    moved = apart(cameras.corrected(wrong, FRAME), wrong)
     assert cameras.moved[cameras.index].mean() == pytest.approx(float(moved.mean()), rel=0.25)
 
 
@@ -151,7 +158,7 @@ def test_corrections_are_the_same_on_a_gpu(fake_gpu):
         cameras = CameraCorrections(CameraGroups.of(views, FRAME)).to(device)
         for step in range(4):
             drawn = batches_of(views).draw(step)
-            rays = cameras.corrected({name: value.to(device) for name, value in drawn.items()})
+            rays = cameras.corrected_rays({name: value.to(device) for name, value in drawn.items()})
             seen = (
                 part.to(device) for part in ball(rays["origins"].cpu(), rays["directions"].cpu())
             )
@@ -233,6 +240,9 @@ def test_a_run_refines_its_cameras(soon, scenes, tmp_path):
     assert 0 < found["mean_px"] <= found["most_px"]
     assert found["farthest"] in found["camera_to_world"]
     assert "cameras  moved by" in (folder / "train.log").read_text()
+    trained = load_run(folder)
+    train = trained.scene.splits["train"]
+    assert train.camera_to_world.tolist() == list(found["camera_to_world"].values())
     loaded = RadianceModule.load_from_checkpoint(folder / "checkpoints" / "last.ckpt")
     same_state(loaded.state_dict(), checkpoint(folder)["state_dict"])
     exact = small_config(scenes, *few, "data.refine_cameras=false", "trainer.max_steps=12")
@@ -262,3 +272,19 @@ def test_a_scene_in_python_says_whether_its_cameras_are_refined():
     for wanted in (False, True):
         data = SceneDataModule.of(replace(scene, refine_cameras=wanted))
         assert ("slopes" in data.batches(0).draw(0)) == wanted
+
+
+def test_a_frame_held_out_of_a_corrected_camera_is_rendered_from_the_corrected_pose(scenes):
+    scene = replace(ball_scene(), refine_cameras=True)
+    module = RadianceModule(small_config(scenes))
+    module.build(scene)
+    views, background = scene.splits["train"], scene.background
+    item = whole_view(views, 0, background)
+    given = module.predict_step(item, 0)
+    module.sampler.parts["cameras"].motion[:, 3] = 0.2
+    poses = module.corrected(views.camera_to_world)
+    moved = replace(views, camera_to_world=poses)
+    parts = module.field, module.renderer, module.frame
+    expected = score_view(*parts, moved, 0, background)[1]["colour"]
+    assert torch.equal(module.predict_step(item, 0)["colour"], expected)
+    assert not torch.equal(given["colour"], expected)

@@ -206,7 +206,7 @@ def refined_cameras(module: RadianceModule, views: Views) -> dict[str, Any]:
     if frame is None or not isinstance(sampler, RefiningSampler):
         return {}
     moved = sampler.cameras.moved[sampler.cameras.index].tolist()
-    poses = sampler.cameras.poses(views.camera_to_world, frame).tolist()
+    poses = sampler.corrected(views.camera_to_world, frame).tolist()
     farthest = max(range(len(moved)), key=moved.__getitem__)
     return {
         "cameras": {

@@ -29,7 +29,7 @@ FIRST = 150
 EVERY = 50
 """Steps between corrections."""
 
-DAMPING, PULL = 0.01, 0.03
+DAMPING, PULL = 0.01, 0.001
 """Weights of a correction and of the distance from the given pose, per mean squared gradient."""
 
 LEAST_MOTION = 0.01
@@ -72,7 +72,7 @@ class RefiningSampler(WrappingSampler):
         return f"{self.inner.outline}, cameras refined".removeprefix(", ")
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
-        rays = self.cameras.corrected(rays)
+        rays = self.cameras.corrected_rays(rays)
         self._seen = rays if state.step >= self.first - self.every else None
         return self.inner.render(field, rays, state)
 
@@ -87,6 +87,9 @@ class RefiningSampler(WrappingSampler):
         done = state.step + 1
         if done >= self.first and done % self.every == 0:
             self.cameras.solve()
+
+    def corrected(self, poses: Tensor, frame: Frame) -> Tensor:
+        return self.inner.corrected(self.cameras.corrected(poses, frame), frame)
 
     def scalars(self) -> dict[str, float]:
         moved = float(self.cameras.moved.mean())
@@ -106,6 +109,7 @@ class CameraCorrections(nn.Module):
 
     index: Tensor
     places: Tensor
+    given: Tensor
     motion: Tensor
     moved: Tensor
     steepness: Tensor
@@ -119,6 +123,7 @@ class CameraCorrections(nn.Module):
         # Not stored in checkpoints: known whenever the field is built.
         self.register_buffer("index", groups.index, persistent=False)
         self.register_buffer("places", groups.places, persistent=False)
+        self.register_buffer("given", groups.poses, persistent=False)
         self.register_buffer("motion", torch.zeros(count, 6))
         self.register_buffer("moved", torch.zeros(count))
         # Sums over the rays since the last correction: squares of the derivatives of colours, their
@@ -128,7 +133,7 @@ class CameraCorrections(nn.Module):
         self.register_buffer("pixels", torch.zeros(count, 6, 6, dtype=exact))
         self.register_buffer("rays", torch.zeros(count, dtype=exact))
 
-    def corrected(self, rays: Batch) -> Batch:
+    def corrected_rays(self, rays: Batch) -> Batch:
         """A batch with the rays of the corrected cameras.
 
         Args:
@@ -147,7 +152,7 @@ class CameraCorrections(nn.Module):
         """Add the rays of a batch to the normal equations.
 
         Args:
-            rays: The batch, with ``slopes``, as `corrected` returned it.
+            rays: The batch, with ``slopes``, as `corrected_rays` returned it.
             rendering: Its rendering.
         """
         origins, directions = rays["origins"], rays["directions"]
@@ -211,19 +216,23 @@ class CameraCorrections(nn.Module):
         for each in sums:
             each.zero_()
 
-    def poses(self, camera_to_world: Tensor, frame: Frame) -> Tensor:
-        """Corrected poses of the training views in the world. [V, 4, 4]
+    def corrected(self, poses: Tensor, frame: Frame) -> Tensor:
+        """Poses in the world, those of training cameras corrected. [V, 4, 4]
 
         Args:
-            camera_to_world: The given poses. [V, 4, 4]
+            poses: Given poses. [V, 4, 4]
             frame: The field's frame.
         """
-        motion = self.motion.to(camera_to_world.device)[self.index.to(camera_to_world.device)]
+        given, motion = self.given.to(poses), self.motion.to(poses.device)
+        if not len(given):
+            return poses
+        known = (given[None] == poses[:, None]).flatten(2).all(dim=-1)
+        motion = known.to(motion) @ motion  # No motion where no camera has this pose.
         turn = frame.rotation.T @ rotations(motion[:, :3]) @ frame.rotation
-        found = camera_to_world.clone()
-        found[:, :3, :3] = turn.to(found) @ camera_to_world[:, :3, :3]
+        found = poses.clone()
+        found[:, :3, :3] = turn.to(found) @ poses[:, :3, :3]
         found[:, :3, 3] += (motion[:, 3:] @ frame.rotation / frame.scale).to(found)
-        return found
+        return torch.where(known.any(dim=1)[:, None, None], found, poses)
 
 
 def rotations(vectors: Tensor) -> Tensor:

@@ -153,6 +153,15 @@ class Sampler(ABC):
             state: Seed and progress of training, for jitter and schedules.
         """
 
+    def corrected(self, poses: Tensor, frame: Frame) -> Tensor:
+        """Poses in the world as training has corrected them; unchanged by default. [V, 4, 4]
+
+        Args:
+            poses: Given poses, such as those of held-out frames of a training camera. [V, 4, 4]
+            frame: The field's frame.
+        """
+        return poses
+
     def losses(self, rendering: Any) -> dict[str, Tensor]:
         """Weighted loss terms of the sampler, by name. [] each"""
         return {}
@@ -221,6 +230,9 @@ class WrappingSampler(Sampler):
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
         return self.inner.render(field, rays, state)
+
+    def corrected(self, poses: Tensor, frame: Frame) -> Tensor:
+        return self.inner.corrected(poses, frame)
 
     def losses(self, rendering: Any) -> dict[str, Tensor]:
         return self.inner.losses(rendering)

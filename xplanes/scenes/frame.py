@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -94,16 +94,18 @@ class CameraGroups:
     Attributes:
         index: Group of each view. int64 [V]
         places: Position of each group's camera, in the field's frame. [C, 3]
+        poses: Its pose in the world; empty in checkpoints of version 0.2. [C, 4, 4]
     """
 
     index: Tensor
     places: Tensor
+    poses: Tensor = field(default_factory=lambda: torch.zeros(0, 4, 4))
 
     @classmethod
     def of(cls, views: Views, frame: Frame) -> "CameraGroups":
         """The groups of the training views; all images of a fixed camera form one group."""
         poses, index = views.camera_to_world.unique(dim=0, return_inverse=True)
-        return cls(index, frame.points(poses[:, :3, 3].float()))
+        return cls(index, frame.points(poses[:, :3, 3].float()), poses)
 
 
 def frame_content(frame: Frame) -> dict[str, Any]:

@@ -31,7 +31,8 @@ class TrainedRun:
     Attributes:
         path: The run directory.
         experiment: The settings.
-        scene: The scene, with the training views and one more split.
+        scene: The scene, with the training views and one more split; poses that training has
+            corrected are corrected.
         split: Name of the other split.
         frame: The field's frame.
         module: The trained module, in evaluation mode.
@@ -144,6 +145,11 @@ def load_run(
     except ConfigError as error:
         raise ConfigError(f"{path} cannot be used: {error}") from error
     module.to(device).eval()
+    splits = {
+        name: replace(views, camera_to_world=module.corrected(views.camera_to_world))
+        for name, views in scene.splits.items()
+    }
+    scene = replace(scene, splits=splits)
     assert module.frame is not None
     return TrainedRun(
         run, replace(experiment, data=data), scene, name, module.frame, module, checkpoint, step

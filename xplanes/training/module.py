@@ -235,6 +235,10 @@ class RadianceModule(ViewScoring):
         """Renders images of the field."""
         return self.parts.sampler.renderer
 
+    def corrected(self, poses: Tensor) -> Tensor:
+        frame = self.frame
+        return poses if frame is None else self.sampler.corrected(poses, frame)
+
     @property
     def shared_parts(self) -> list[nn.Module]:
         return list(self.sampler.parts.values())

@@ -3,7 +3,7 @@
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -191,6 +191,10 @@ class ViewScoring(LightningModule):
     def renderer(self) -> Renderer:
         """Renders images of the field."""
 
+    @abstractmethod
+    def corrected(self, poses: Tensor) -> Tensor:
+        """Poses in the world as training has corrected them. [V, 4, 4]"""
+
     @property
     @abstractmethod
     def shared_parts(self) -> list[nn.Module]:
@@ -198,9 +202,11 @@ class ViewScoring(LightningModule):
 
     def predict_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
         """One view: ``colour`` [H, W, 3], ``opacity`` and ``depth`` [H, W]."""
-        frame = self.frame
+        frame, camera = self.frame, batch["camera"]
         assert frame is not None
-        return render_item(self.field, self.renderer, frame, batch)
+        pose = self.corrected(camera.camera_to_world[None])[0]
+        item = batch | {"camera": replace(camera, camera_to_world=pose)}
+        return render_item(self.field, self.renderer, frame, item)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
         """Render and score a view; the mean scores are logged at the end of the epoch."""

@@ -2,13 +2,12 @@
 
 import itertools
 from dataclasses import replace
-from itertools import product
 
 import pytest
 import torch
 
 from tests.balls import RAYS, ball_views
-from tests.oracles import project
+from tests.scenes.common import assert_even, same
 from xplanes.errors import ConfigError
 from xplanes.scenes.batches import NEAR_SILHOUETTE, RayBatches
 from xplanes.scenes.frame import Frame, cube_frame
@@ -25,20 +24,17 @@ def batches_of(views=VIEWS, frame=FRAME, *, seed=0, rank=0, **options):
     return RayBatches(views, frame, replace(RAYS, **options), seed=seed, rank=rank)
 
 
-def same(first, second):
-    assert first.keys() == second.keys()
-    return all(torch.equal(first[name], second[name]) for name in first)
-
-
-def test_a_batch_depends_on_its_step_alone():
-    for background in ("white", "random"):
-        fresh, used = batches_of(background=background), batches_of(background=background)
-        for step in (0, 17, 3, 10**9):
-            used.draw(step)
-        torch.manual_seed(5)
-        torch.rand(100)
-        for step in (0, 1, 17, 10**9):
-            assert same(fresh.draw(step), used.draw(step)), (background, step)
+@pytest.mark.parametrize("background", ["white", "random"])
+def test_a_batch_depends_on_its_step_alone(background):
+    fresh, used = batches_of(background=background), batches_of(background=background)
+    for step in (0, 17, 3, 10**9):
+        used.draw(step)
+    torch.manual_seed(5)
+    torch.rand(100)
+    state = torch.get_rng_state()
+    for step in (0, 1, 17, 10**9):
+        assert same(fresh.draw(step), used.draw(step)), step
+    assert torch.equal(torch.get_rng_state(), state), "other numbers are drawn"
 
 
 def test_steps_ranks_and_seeds_draw_different_rays():
@@ -49,13 +45,6 @@ def test_steps_ranks_and_seeds_draw_different_rays():
     for first, second in itertools.combinations(drawn, 2):
         assert not torch.equal(first["jitter"], second["jitter"])
         assert not torch.equal(first["directions"], second["directions"])
-
-
-def test_drawing_does_not_touch_the_global_generator():
-    torch.manual_seed(0)
-    before = torch.get_rng_state()
-    batches_of(background="random").draw(4)
-    assert torch.equal(before, torch.get_rng_state())
 
 
 def test_neighbouring_generators_share_nothing():
@@ -72,47 +61,42 @@ def test_neighbouring_generators_share_nothing():
     assert abs(float(first.mean()) - 0.5) < 0.02
 
 
-def pixels_of(batch, views, frame):
-    """View, row and column of each ray, found by projecting a point of it into every view."""
-    found = []
-    origins, points = (
-        frame.to_world(p) for p in (batch["origins"], batch["origins"] + batch["directions"])
-    )
-    for origin, point, time in zip(origins, points, batch["times"], strict=True):
-        (view,) = (views.times == time).nonzero().flatten().tolist()
-        pose = views.camera_to_world[view]
-        torch.testing.assert_close(origin, pose[:3, 3], atol=1e-5, rtol=0)
-        row, column, ok = project(
-            point.double().numpy(), pose.double().numpy(), FOCAL, views.height, views.width
-        )
-        assert ok
-        found.append((view, row, column))
-    return torch.tensor(found).T
+def pixels_of(batch, views, frame=FRAME):
+    """View, row and column of each ray: its camera's, and where it passes the image plane."""
+    cameras = views.camera_to_world.double()
+    origins = frame.to_world(batch["origins"])
+    away = torch.cdist(origins.double(), cameras[:, :3, 3])
+    assert away.amin(dim=1).max() < 1e-5
+    view = away.argmin(dim=1)
+    directions = (frame.to_world(batch["origins"] + batch["directions"]) - origins).double()
+    right, up, back = (directions[:, None] @ cameras[view, :3, :3])[:, 0].T
+    row = -up / -back * FOCAL + views.height / 2
+    column = right / -back * FOCAL + views.width / 2
+    return view, row.floor().long(), column.floor().long()
 
 
-def test_targets_are_the_pixels_that_the_rays_go_through():
-    colours = torch.randint(
-        0, 256, VIEWS.images.shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8
-    )
+TURNED = Frame(0.3, torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), torch.ones(3))
+
+
+@pytest.mark.parametrize("background", ["white", "random"])
+@pytest.mark.parametrize("frame", [FRAME, TURNED], ids=["plain frame", "turned frame"])
+def test_targets_are_the_pixels_that_the_rays_go_through(background, frame):
+    generator = torch.Generator().manual_seed(0)
+    colours = torch.randint(0, 256, VIEWS.images.shape, generator=generator, dtype=torch.uint8)
     colours[..., :3] = torch.minimum(colours[..., :3], colours[..., 3:])  # multiplied by alpha
-    views = VIEWS.__class__(colours, VIEWS.camera_to_world, VIEWS.times, FOCAL, VIEWS.files)
-    turned = Frame(0.3, torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), torch.ones(3))
-    for background, frame in product(("white", "random"), (FRAME, turned)):
-        case = f"{background} background, frame of scale {frame.scale}"
-        batch = batches_of(views, frame, background=background).draw(3)
-        view, row, column = pixels_of(batch, views, frame)
-        pixel = colours[view, row, column].double() / 255
-        expected = pixel[:, :3] + (1 - pixel[:, 3:]) * batch["background"].double()
-        assert (batch["target"].double() - expected).abs().max() < 1e-6, case
-        torch.testing.assert_close(batch["directions"].norm(dim=-1), torch.ones(64))
-        assert torch.equal(batch["times"], views.times[view]), case
-        white = (batch["background"] == 1).all()
-        assert white == (background == "white"), case
-        for index in range(len(views)):
-            image = views.composite(index, torch.ones(3))
-            assert not white or torch.allclose(
-                batch["target"][view == index], image[row[view == index], column[view == index]]
-            ), case
+    views = replace(VIEWS, images=colours)
+    batch = batches_of(views, frame, background=background).draw(3)
+    view, row, column = pixels_of(batch, views, frame)
+    pixel = colours[view, row, column].double() / 255
+    expected = pixel[:, :3] + (1 - pixel[:, 3:]) * batch["background"].double()
+    assert (batch["target"].double() - expected).abs().max() < 1e-6
+    torch.testing.assert_close(batch["directions"].norm(dim=-1), torch.ones(64))
+    assert torch.equal(batch["times"], views.times[view])
+    white = bool((batch["background"] == 1).all())
+    assert white == (background == "white")
+    if white:
+        images = torch.stack([views.composite(i, torch.ones(3)) for i in range(len(views))])
+        torch.testing.assert_close(batch["target"], images[view, row, column])
 
 
 def test_one_background_is_shared_by_a_batch_and_changes_between_batches():
@@ -126,48 +110,26 @@ def test_one_background_is_shared_by_a_batch_and_changes_between_batches():
     assert torch.equal(first["target"][empty], first["background"][empty])
 
 
-def near_share(batches, steps=40):
-    """Share of drawn rays near the silhouettes."""
-    views = batches.views
-    margin = max(1, round(NEAR_SILHOUETTE * views.width))
-    near = foreground(views, margin)
-    found = []
-    for step in range(steps):
-        view, row, column = pixels_of(batches.draw(step), views, FRAME)
-        found.append(near[view, row, column])
-    return float(torch.cat(found).float().mean()), float(near.float().mean())
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.4])
+def test_the_share_of_background_rays_is_the_asked_one(share):
+    batches = batches_of(background_share=share, per_batch=2000)
+    near = foreground(VIEWS, max(1, round(NEAR_SILHOUETTE * VIEWS.width)))
+    drawn = float(near[pixels_of(batches.draw(0), VIEWS)].float().mean())
+    assert drawn == pytest.approx(1 - share, abs=4 * (share * (1 - share) / 2000) ** 0.5)
+    natural = float(near.float().mean())
+    assert batches.skipped == pytest.approx(1 - natural - share)
 
 
-def test_the_share_of_background_rays_is_the_asked_one():
-    for share in (0.0, 0.1, 0.4):
-        batches = batches_of(background_share=share)
-        drawn, natural = near_share(batches, steps=30)
-        margin = 4 * (share * (1 - share) / (30 * 64)) ** 0.5
-        assert drawn == pytest.approx(1 - share, abs=margin), share
-        assert batches.skipped == pytest.approx(1 - natural - share), share
-
-
-def test_without_skipping_pixels_are_drawn_evenly():
-    for options in ({"skip_background": False}, {"background_share": 1.0}):
-        batches = batches_of(per_batch=20_000, **options)
-        assert batches.skipped == 0, options
-        views = batches.views
-        height, width = views.height, views.width
-        counts = torch.zeros(len(views) * height * width)
-        for step in range(10):
-            batch = batches.draw(step)
-            origins = FRAME.to_world(batch["origins"])
-            view = torch.cdist(origins, views.camera_to_world[:, :3, 3]).argmin(dim=1)
-            local = (batch["directions"][:, None] @ views.camera_to_world[view, :3, :3])[:, 0]
-            column = (local[:, 0] / -local[:, 2] * FOCAL + width / 2).floor().long()
-            row = (-local[:, 1] / -local[:, 2] * FOCAL + height / 2).floor().long()
-            pixel = (view * height + row) * width + column
-            counts += torch.bincount(pixel, minlength=len(counts))
-        expected = counts.sum() / len(counts)
-        chi_squared = float(((counts - expected).square() / expected).sum())
-        freedom = len(counts) - 1
-        assert abs(chi_squared - freedom) < 5 * (2 * freedom) ** 0.5, options
-        assert counts.min() > 0, options
+@pytest.mark.parametrize("options", [{"skip_background": False}, {"background_share": 1.0}])
+def test_without_skipping_pixels_are_drawn_evenly(options):
+    batches = batches_of(per_batch=20_000, **options)
+    assert batches.skipped == 0
+    counts = torch.zeros(VIEWS.images.shape[:3])
+    for step in range(5):
+        places = pixels_of(batches.draw(step), VIEWS)
+        counts.index_put_(places, torch.ones(20_000), accumulate=True)
+    assert_even(counts)
+    assert counts.min() > 0
 
 
 def floor_views(side=120):

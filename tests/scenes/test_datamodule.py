@@ -9,6 +9,7 @@ from torch.utils.data import DistributedSampler
 
 from tests.balls import RAYS as WHITE
 from tests.balls import ball_scene
+from tests.scenes.common import same
 from xplanes.errors import ConfigError
 from xplanes.scenes.batches import RayBatches
 from xplanes.scenes.datamodule import UNIFORM, SceneDataModule, spread_order
@@ -32,10 +33,6 @@ def module_of(trained=0, rank=0):
 def take(module, count):
     stream = iter(module.train_dataloader())
     return [next(stream) for _ in range(count)]
-
-
-def same(first, second):
-    return all(torch.equal(first[name], second[name]) for name in first)
 
 
 def test_batches_are_those_of_the_steps_in_order():
@@ -126,14 +123,14 @@ def test_nothing_shows_what_is_held_out_if_all_of_it_is():
 
 
 def test_as_many_views_are_held_out_as_are_scored_at_most():
-    data = SceneDataModule.of(ball_scene(count=40))
-    data.setup("fit")
-    assert (len(data.scene.splits["train"]), len(data.scene.splits["val"])) == (35, 5)
-    few = SceneDataModule.of(ball_scene(count=40))
-    few.settings = replace(few.settings, eval_views=2)
-    few.setup("fit")
-    assert (len(few.scene.splits["train"]), len(few.scene.splits["val"])) == (38, 2)
-    assert set(few.scene.splits["val"].files) < set(data.scene.splits["val"].files)
+    held_out = {}
+    for most, counts in ((None, (35, 5)), (2, (38, 2))):
+        data = SceneDataModule.of(ball_scene(count=40))
+        data.settings = replace(data.settings, eval_views=most or data.settings.eval_views)
+        data.setup("fit")
+        assert tuple(len(data.scene.splits[name]) for name in ("train", "val")) == counts
+        held_out[most] = set(data.scene.splits["val"].files)
+    assert held_out[2] < held_out[None]
 
 
 def test_a_module_that_says_nothing_gets_rays_over_all_pixels_in_the_scenes_cube():

@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from tests import fake_device
-from tests.scenes.test_batches import batches_of, same
+from tests.scenes.common import same
+from tests.scenes.test_batches import batches_of
 from xplanes.scenes.batches import DeviceBatches
+from xplanes.scenes.importance import MOST_TILES
 from xplanes.streams import counted_uniform, step_generator
 
 CPU = torch.device("cpu")
@@ -42,19 +44,32 @@ def test_numbers_are_even_and_independent():
     assert torch.stack([found.flatten(), following.flatten()]).corrcoef()[0, 1].abs() < 0.02
 
 
-@pytest.mark.parametrize("slopes", [False, True])
-@pytest.mark.parametrize("background", ["white", "random", "one"])
-def test_batches_have_the_same_bits_on_every_device(fake_gpu, background, slopes):
-    batches = batches_of(background=background, background_jitter=0.1, seed=2, rank=1)
+@pytest.mark.parametrize(
+    ("slopes", "options"),
+    [
+        *((slopes, {"background": kind}) for slopes in (False, True) for kind in ("white", "one")),
+        (True, {"background": "random"}),
+        (False, {"background": "random", "error_share": 0.5}),
+    ],
+)
+def test_batches_have_the_same_bits_on_every_device(fake_gpu, slopes, options):
+    batches = batches_of(background_jitter=0.1, seed=2, rank=1, **options)
     if slopes:
         batches.add_slopes()
+    errors = torch.full((MOST_TILES,), 0.1)
+    errors[[0, 3]] = torch.tensor([1.0, 0.5])
     here, there = DeviceBatches(batches, CPU), DeviceBatches(batches, fake_gpu)
+    errors_there = errors.to(fake_gpu)
     for step in (0, 7, 10**9):
         with fake_device.counted() as counts:
-            drawn = there.draw(step)
+            drawn = there.draw(step, 48, errors_there)
         assert counts.totals[1:] == (0, 0)
         assert {value.device for value in drawn.values()} == {fake_gpu}
-        assert same({name: value.cpu() for name, value in drawn.items()}, here.draw(step))
+        expected = here.draw(step, 48, errors)
+        assert same({name: value.cpu() for name, value in drawn.items()}, expected)
+        assert len(drawn["times"]) == 48
+        # Errors from a checkpoint may lie on the host.
+        assert same(drawn, there.draw(step, 48, errors))
     assert here.draw(3).keys() == batches.draw(3).keys()
     assert not torch.equal(here.draw(3)["jitter"], here.draw(4)["jitter"])
 

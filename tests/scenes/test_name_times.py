@@ -34,6 +34,8 @@ from xplanes.scenes.name_times import times_in_names
         ("cam1/007 cam1/008 cam2/007 cam2/011", [0, 0.25, 0, 1]),
         ("t_001/cam1 t_002/cam1 t_005/cam2", [0, 0.25, 1]),
         ("rig1/camera1/i0001 rig1/camera2/i0002 rig1/camera1/i0005", [0, 0.25, 1]),
+        ("034_cam0 036cam1 044-Camera_2", [0, 0.2, 1]),
+        ("a_1_4k a_2_4k a_5_4k", [0, 0.25, 1]),
         ("clip_1_1080p clip_2_1080p clip_5_1080p", [0, 0.25, 1]),
         ("12345678_200001 12345678_200002 12345678_200005", [0, 0.25, 1]),
         ("cam1 cam2 cam5", [0, 0.25, 1]),

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from tests.balls import ball_views, inside_ball, swinging
-from tests.oracles import project, visual_hull
+from tests.oracles import visual_hull
 from xplanes.scenes.silhouettes import MOST_VIEWS, WINDOW, foreground, join_in_time, may_hold
 
 
@@ -56,7 +56,7 @@ def test_without_a_radius_the_hull_is_that_of_projected_points():
 
 
 def test_a_moving_hull_asks_every_view_of_some_span_around():
-    for count in (12, 34, 90):
+    for count in (12, 34):
         views = ball_views(count, 0.5, centre=swinging(0.5, 1), size=24)
         points = grid_points(cells=5)
         alpha, poses = views.images[..., 3].numpy(), views.camera_to_world.double().numpy()
@@ -85,21 +85,6 @@ def test_the_radius_keeps_whatever_a_ball_around_the_point_could_hold():
         assert (found | ~alone).all(), radius
         beyond = (distance > 0.6 + 1.6 * radius) & (distance < 1.4)
         assert not found[beyond].any(), radius  # all in sight
-
-
-def test_what_is_out_of_sight_is_not_ruled_out():
-    views = ball_views(4, 0.3, size=24, times=torch.zeros(4), angle=0.2)
-    points = grid_points(half=3.0, cells=7)
-    found = silhouette_hull(views, points, radius=0.0)[0]
-    poses = views.camera_to_world.double().numpy()
-    unseen = torch.tensor(
-        [
-            not any(project(p, pose, focal_of(views), 24, 24)[2] for pose in poses)
-            for p in points.numpy()
-        ]
-    )
-    assert unseen.any()
-    assert found[unseen].all()
 
 
 def test_points_at_and_behind_the_camera_are_not_ruled_out():

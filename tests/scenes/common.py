@@ -11,7 +11,6 @@ from functools import partial
 
 import numpy as np
 import torch
-from PIL import Image
 
 from tests.captures import save, settings
 from tests.refusals import assert_refused
@@ -48,13 +47,6 @@ def assert_same_rays(views, index, other, place, atol=1e-5):
         torch.testing.assert_close(mine, theirs, atol=atol, rtol=0)
 
 
-def change(content, changes):
-    """Change keys of a dictionary; those set to ... are taken out."""
-    content.update(changes)
-    for key in [key for key, value in content.items() if value is ...]:
-        del content[key]
-
-
 def rgba(seed, width=12, height=None):
     """Straight colour with soft and fully transparent parts. uint8 [height, width, 4]"""
     height = height or width
@@ -70,18 +62,60 @@ def pose(index):
     return look_at(place)[0].tolist()
 
 
-class SceneFolder:
-    """A small scene of Blender's on disk whose transforms can be changed before it is read."""
+class Transforms:
+    """A capture on disk with cameras in JSON, which can be changed before it is read."""
+
+    kind, option, file = BlenderSettings, "blender", "transforms_{}.json"
 
     def __init__(self, path):
-        self.path = path
-        self.contents = {}
+        self.path, self.contents = path, {}
+
+    def frames(self, split="train"):
+        return self.contents[split]["frames"]
+
+    def image(self, index):
+        return (self.path / self.frames()[index]["file_path"]).with_suffix(".png")
+
+    def change(self, index=None, split="train", **changes):
+        """Change keys of a frame, or of the file; those set to ... are taken out."""
+        content = self.contents[split] if index is None else self.frames(split)[index]
+        content.update(changes)
+        for key in [key for key, value in content.items() if value is ...]:
+            del content[key]
+
+    def change_each(self, split="train", **changes):
+        """Change keys of all frames: to what a function makes of them, or to the same value."""
+        for index, frame in enumerate(self.frames(split)):
+            new = {key: to(frame[key]) if callable(to) else to for key, to in changes.items()}
+            self.change(index, split, **new)
+
+    def write(self):
+        for split, content in self.contents.items():
+            (self.path / self.file.format(split)).write_text(json.dumps(content))
+
+    def load(self, splits=("train",), **changes):
+        """What is read of the files as they are."""
+        return settings(self.kind, self.option, self.path, **changes).load(splits)
+
+    def read(self, *arguments, **changes):
+        self.write()
+        return self.load(*arguments, **changes)
+
+    def train(self, **changes):
+        return self.read(**changes).splits["train"]
+
+    def refused(self, *words, case=None, error=SceneError, **arguments):
+        return refused(partial(self.read, **arguments), *words, case=case, error=error)
+
+
+class SceneFolder(Transforms):
+    """A small scene of Blender's."""
 
     def add(self, split, sizes, *, fixed=False, shared=None, frames=None):
         """Images, of 12x12 pixels if ``sizes`` is their number, and keys of each frame."""
         sizes = [(12, 12)] * sizes if isinstance(sizes, int) else sizes
         content = {"camera_angle_x": ANGLE} if shared is None else dict(shared)
-        content["frames"] = []
+        self.contents[split] = content | {"frames": []}
         for i, (width, height) in enumerate(sizes):
             save(self.path / split / f"r_{i}.png", rgba(i, width, height))
             frame = {
@@ -89,43 +123,9 @@ class SceneFolder:
                 "time": i / max(len(sizes) - 1, 1),
                 "transform_matrix": pose(0 if fixed else i),
             }
-            content["frames"].append(frame | (frames[i] if frames else {}))
-        self.contents[split] = content
-        self.write(split)
+            self.frames(split).append(frame | (frames[i] if frames else {}))
+        self.write()
         return self
-
-    def frames(self, split="train"):
-        return self.contents[split]["frames"]
-
-    def change(self, index=None, split="train", **changes):
-        """Change keys of a frame, or of the file; those set to ... are taken out."""
-        change(self.contents[split] if index is None else self.frames(split)[index], changes)
-        self.write(split)
-
-    def write(self, split="train"):
-        text = json.dumps(self.contents[split])
-        (self.path / f"transforms_{split}.json").write_text(text)
-
-    def without_times(self, split="train"):
-        for frame in self.frames(split):
-            del frame["time"]
-        self.write(split)
-
-    def image(self, index, pixels=None):
-        """The path of a training image, which gets other pixels if there are some."""
-        path = self.path / "train" / f"r_{index}.png"
-        if pixels is not None:
-            Image.fromarray(pixels).save(path)
-        return path
-
-    def read(self, splits=("train",), **changes):
-        return settings(BlenderSettings, "blender", self.path, **changes).load(splits)
-
-    def train(self, **changes):
-        return self.read(**changes).splits["train"]
-
-    def refused(self, *words, case=None, **arguments):
-        return refused(partial(self.read, **arguments), *words, case=case)
 
 
 def same(first, second):

@@ -120,9 +120,9 @@ def test_the_share_of_background_rays_is_the_asked_one(share):
     assert batches.skipped == pytest.approx(1 - natural - share)
 
 
-@pytest.mark.parametrize("options", [{"skip_background": False}, {"background_share": 1.0}])
-def test_without_skipping_pixels_are_drawn_evenly(options):
-    batches = batches_of(per_batch=20_000, **options)
+@pytest.mark.parametrize(("option", "value"), [("skip_background", False), ("background_share", 1)])
+def test_without_skipping_pixels_are_drawn_evenly(option, value):
+    batches = batches_of(per_batch=20_000, **{option: value})
     assert batches.skipped == 0
     counts = torch.zeros(VIEWS.images.shape[:3])
     for step in range(5):

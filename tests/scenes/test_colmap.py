@@ -46,13 +46,14 @@ class Capture:
             save(path / "images" / name, picture(index))
         self.write()
 
-    def write(self, cameras=CAMERA, camera=1, keep=None, text=False):
-        images = [
-            (name, pose, camera, index % 3)
-            for index, (name, pose) in enumerate(zip(self.names, self.poses, strict=True))
-            if keep is None or index in keep
-        ]
-        write_colmap(self.path / "sparse" / "0", cameras, images, POINTS, text=text)
+    def write(self, cameras=CAMERA, camera=1, keep=None, text=False, model="sparse/0"):
+        keep = range(len(self.names)) if keep is None else keep
+        images = [(self.names[i], self.poses[i], camera, i % 3) for i in keep]
+        write_colmap(self.path / model, cameras, images, POINTS, text=text)
+
+    def move(self, poses):
+        self.poses = poses
+        self.write()
 
     def settings(self, **changes):
         return settings(ColmapSettings, "colmap", self.path, **{"orient": False, **changes})
@@ -172,9 +173,9 @@ def test_the_world_is_turned_upright_as_a_whole(capture):
     tilt = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     tilt *= np.linalg.det(tilt)
     for turn in (tilt, np.diag([1.0, -1.0, -1.0]), np.eye(3)[[0, 2, 1]] * [1, 1, -1]):
-        capture.poses = poses(8)
-        capture.poses[:, :3] = turn @ capture.poses[:, :3]
-        capture.write()
+        whole = poses(8)
+        whole[:, :3] = turn @ whole[:, :3]
+        capture.move(whole)
         scene = capture.read("train", orient=True, eval_every=100)
         found = scene.splits["train"].camera_to_world.double().numpy()
         up = found[:, :3, 1].mean(axis=0)
@@ -186,8 +187,7 @@ def test_the_world_is_turned_upright_as_a_whole(capture):
         points = np.hstack([scene.points.double().numpy(), np.ones((2, 1))])
         places = np.linalg.inv(capture.poses[2]) @ np.hstack([POINTS, np.ones((2, 1))]).T
         assert np.abs(np.linalg.inv(found[2]) @ points.T - places).max() < 1e-5
-    capture.poses = poses(8)
-    capture.write()
+    capture.move(poses(8))
     found = capture.views(orient=True).camera_to_world[:, :3, 1].numpy()
     assert np.abs(found - capture.poses[:, :3, 1]).max() < 0.2
 
@@ -259,9 +259,8 @@ def test_a_model_or_images_that_are_not_where_they_are_said_to_be(capture):
 
 @pytest.mark.parametrize("text", [False, True])
 def test_the_largest_of_several_models_is_read(capture, caplog, text):
-    images = [(f"frame_00{i}.png", capture.poses[i], 1, 2) for i in range(8)]
-    write_colmap(capture.path / "sparse/1", CAMERA, images, text=text)
-    write_colmap(capture.path / "sparse/0", CAMERA, images[:3])
+    capture.write(text=text, model="sparse/1")
+    capture.write(keep=range(3))
     assert len(capture.views()) == 8
     assert "sparse/1 is read, which has the most images (0 has 3, 1 has 8)" in caplog.text
     caplog.clear()
@@ -401,8 +400,7 @@ def test_times_by_rank_count_what_was_not_registered(tmp_path, caplog):
 
 
 def test_one_camera_and_time_twice(capture):
-    capture.poses[3] = capture.poses[2]
-    capture.write()
+    capture.move(capture.poses[[0, 1, 2, 2, 4, 5, 6, 7]])
     assert len(capture.views()) == 8
     rows = [f"{name},{max(index, 3)}" for index, name in enumerate(capture.names)]
     (capture.path / "times.csv").write_text("\n".join(["file,time", *rows]))
@@ -510,48 +508,41 @@ def test_lines_of_points_may_be_missing(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("camera", "lens", "words"),
     [
-        ({"camera": 5}, "frame_000.png was taken by camera 5, which cameras.bin does not list"),
-        (
-            {"cameras": {1: (11, 4, 3, (1.0,) * 16)}},
-            r"cameras\.bin: camera 1 has the camera model number 11.*These are: SIMPLE_PINH",
-        ),
-        (
-            {"cameras": {1: ("FOV", 40, 30, (9.0, 9.0, 1.0, 1.0, 4.0))}},
-            "omega=4.0; it must lie between 0 and pi",
-        ),
+        (5, CAMERA[1], "frame_000.png was taken by camera 5, which cameras.bin does not list"),
+        (1, (11, 4, 3, (1.0,) * 16), r"cameras\.bin: .*model number 11.*These are: SIMPLE_PINH"),
+        (1, ("FOV", 40, 30, (9.0, 9.0, 1.0, 1.0, 4.0)), "omega=4.0; it must lie between 0 and pi"),
     ],
     ids=["unknown camera", "unknown model", "lens that cannot be"],
 )
-def test_cameras_that_cannot_be(capture, changes, words):
-    capture.write(**changes)
+def test_cameras_that_cannot_be(capture, camera, lens, words):
+    capture.write({1: lens}, camera)
     capture.refused(words)
 
 
 def test_poses_that_cannot_be(capture):
     whole = capture.poses.copy()
+
+    def move(place, index=slice(None)):
+        moved = whole.copy()
+        moved[index, :3, 3] += place
+        capture.move(moved)
+
     for value in (math.nan, math.inf):
-        capture.poses[4, 0, 3] = value
-        capture.write()
+        move(value, 4)
         with told(r"1 of 8 images are left out:\n.*frame_004\.p"):
             assert len(capture.views()) == 7
-    capture.poses = whole
-    capture.write()
-    near = capture.views()
-    capture.poses[:, :3, 3] += 4e6
-    capture.write()
+    move(4e6)
     with told(r"read relative to \(40000"):
-        far = capture.views()
-    shift = (far.camera_to_world - near.camera_to_world)[:, :3, 3]
-    torch.testing.assert_close(shift, shift[:1].expand_as(shift), atol=1e-5, rtol=0)
-    capture.poses[0, :3, 3] += 1e30
-    capture.write()
+        far = capture.views().camera_to_world[:, :3, 3].double().numpy()
+    shift = far - whole[:, :3, 3]
+    assert np.abs(shift - shift[0]).max() < 1e-5
+    move(1e30, 0)
     capture.refused("cameras lie up to .*single precision.*model_transformer")
     generator = np.random.default_rng(0)
     require_precision(Path("video"), 4 + 4e-5 * generator.random((5, 3)))  # A camera that trembles.
-    capture.poses = poses(8)
-    capture.write()
+    capture.move(whole)
     path = capture.path / "sparse/0/images.bin"
     data = bytearray(path.read_bytes())
     data[12:20] = struct.pack("<d", 7.0)
@@ -562,5 +553,6 @@ def test_poses_that_cannot_be(capture):
 def test_names_that_leave_the_folder(capture):
     save(capture.path.parent / "secret.png", picture(0))
     for name in ("../../secret.png", str(capture.path.parent / "secret.png")):
-        write_colmap(capture.path / "sparse/0", CAMERA, [(name, capture.poses[0], 1, 0)])
+        capture.names[0] = name
+        capture.write(keep=[0])
         capture.refused(r"images\.bin: .*secret\.png: (NAME leaves the scene's|no image)")

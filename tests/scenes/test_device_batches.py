@@ -51,6 +51,7 @@ def test_numbers_are_even_and_independent():
         (True, {"background": "random"}),
         (False, {"background": "random", "error_share": 0.5}),
     ],
+    ids=str,
 )
 def test_batches_have_the_same_bits_on_every_device(fake_gpu, slopes, options):
     batches = batches_of(background_jitter=0.1, seed=2, rank=1, **options)

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shutil
 from dataclasses import replace
 from functools import partial
 
@@ -110,16 +111,16 @@ def test_cmyk_is_refused_with_a_message(scene):
 
 
 def test_no_times_at_all_is_a_static_scene(scene):
-    scene.without_times()
+    scene.change_each(time=...)
     scene.change(1, transform_matrix=scene.frames()[0]["transform_matrix"])
     assert scene.train().times.tolist() == [0] * 5
 
 
 @pytest.mark.parametrize(("split", "splits"), [("test", ["train", "test"]), ("video", ["train"])])
 def test_frames_without_times_do_not_pass_for_those_of_time_zero(scene, split, splits):
-    scene.add(split, 3, fixed=split == "video").without_times(split)
+    scene.add(split, 3, fixed=split == "video").change_each(split, time=...)
     scene.refused(f"transforms_{split}.json", "Give every frame its time", splits=splits)
-    scene.without_times()
+    scene.change_each(time=...)
     assert scene.train(splits=splits).is_static
 
 
@@ -139,10 +140,8 @@ def test_times_of_all_splits_are_mapped_together(tmp_path, write, found):
     expected = {"train": [0, 0.2, 0.4, 0.6, 0.8], "val": [0.1, 0.5, 0.7], "test": [0, 1]}
     for split, times in expected.items():
         scene.add(split, len(times))
-        for frame, time in zip(scene.frames(split), times, strict=True):
-            del frame["time"]
-            frame |= write(time)
-        scene.write(split)
+        for index, time in enumerate(times):
+            scene.change(index, split, **{"time": ..., **write(time)})
     is_mapped = scene.frames("test")[-1].get("time") != 0.5
     with told("is mapped to times from 0 to 1" if is_mapped else None):
         parts = scene.read(("train", "val")).splits | scene.read(("test",)).splits
@@ -206,7 +205,7 @@ def test_missing_folder_names_its_neighbours_and_the_ways_out(scene):
         (".", f"holds no transforms_train.json. Such scenes in {root}: ball."),
     ):
         scene.path = root / path
-        scene.refused(*words)
+        refused(scene.load, *words)
 
 
 def test_missing_split(scene):
@@ -227,7 +226,7 @@ def test_missing_split(scene):
 def test_files_that_are_no_json_or_hold_no_frames(scene, words, texts):
     for text in texts:
         (scene.path / "transforms_train.json").write_bytes(text.encode("latin-1"))
-        scene.refused("transforms_train.json", words, case=text[:10])
+        refused(scene.load, "transforms_train.json", words, case=text[:10])
 
 
 def test_damaged_images_are_refused_and_empty_ones_told_of(scene):
@@ -237,7 +236,7 @@ def test_damaged_images_are_refused_and_empty_ones_told_of(scene):
     for content in (whole[: len(whole) // 2], bytes(flipped), b"no image"):
         scene.image(2).write_bytes(content)
         scene.refused("r_2.png", "cannot be decoded", case=content[:8])
-    scene.image(2, 0 * rgba(2))
+    save(scene.image(2), 0 * rgba(2))
     with told(r"1 of 5 images show nothing.*r_2\.png"):
         scene.read()
 
@@ -264,10 +263,9 @@ def test_all_that_is_wrong_is_said_at_once(scene):
 
 @pytest.mark.parametrize("kind", ["no frames", "no images"])
 def test_a_split_that_was_not_rendered_is_left_out(scene, kind):
-    text = json.dumps(scene.contents["train"]).replace("./train", "./never")
-    content = json.loads(text) | ({"frames": []} if kind == "no frames" else {})
     for split in ("test", "val"):
-        (scene.path / f"transforms_{split}.json").write_text(json.dumps(content))
+        scene.add(split, 0 if kind == "no frames" else 5)
+        shutil.rmtree(scene.path / split, ignore_errors=True)
     config = compose_plain("train", ["data=blender", f"data.root={scene.path.parent}"])
     given = {**config["data"], "scene": scene.path.name, "resolution": None}
     with pytest.warns(UserWarning, match="The (test|val) split is left out"):
@@ -277,7 +275,7 @@ def test_a_split_that_was_not_rendered_is_left_out(scene, kind):
 
 def test_resolutions_that_images_do_not_have(scene):
     scene.refused("data.resolution=13", "at most 12", resolution=13)
-    scene.image(3, rgba(0, 8)[:6])
+    save(scene.image(3), rgba(0, 8)[:6])
     assert scene.train(resolution=4).size(3) == (3, 4)
     scene.refused("data.resolution=9 is more than the 8 pixels", "r_3.png", resolution=9)
     # A video needs frames of equal size.
@@ -356,8 +354,7 @@ def test_masks_of_a_car_bonnet_are_ignored(scene):
     mask = np.full((12, 12), 255, np.uint8)
     mask[9:] = 0
     save(scene.path / "train" / "bonnet.png", mask)
-    for index in range(5):
-        scene.change(index, mask_path="train/bonnet.png")
+    scene.change_each(mask_path="train/bonnet.png")
     views = scene.train()
     assert views.ignored[:, 9:].all()
     assert not views.ignored[:, :9].any()
@@ -369,7 +366,7 @@ def test_masks_become_alpha(scene):
     grey[:, 6:9] = 51
     straight = rgba(0)
     straight[..., 3] = 255
-    scene.image(1, straight)
+    save(scene.image(1), straight)
     whole = scene.train().image(0)
     ones = grey // 255
     three = np.stack([grey] * 3, axis=2)
@@ -451,10 +448,8 @@ def test_values_that_keys_cannot_have_are_refused_by_their_key(scene):
 
 
 def test_a_world_on_its_side_is_told_of(scene):
-    for frame in scene.frames():
-        x, y, z, last = frame["transform_matrix"]
-        frame["transform_matrix"] = [x, z, [-value for value in y], last]
-    scene.write()
+    lying = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    scene.change_each(transform_matrix=lambda matrix: (lying @ matrix).tolist())
     with told("mean up vector is .* degrees off. If the scene lies on"):
         scene.read()
 

@@ -4,7 +4,6 @@ import json
 import logging
 import math
 import unicodedata
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from PIL import Image
 
 from tests.balls import ball_views, surrounding
 from tests.captures import save, settings
-from tests.scenes.common import assert_same_rays, change, refused, told
+from tests.scenes.common import Transforms, assert_same_rays, refused, told
 from xplanes.errors import MissingSplitError
 from xplanes.scenes import store
 from xplanes.scenes.batches import RayBatches, ViewBatches, ViewSettings
@@ -31,62 +30,33 @@ FOCAL = 0.5 * SIZE / math.tan(0.5 * ANGLE)
 PINHOLE = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 12.0, "cy": 12.0, "w": SIZE, "h": SIZE}
 
 
-def read_capture(folder, splits=("train",), **changes):
-    return settings(NerfstudioSettings, "nerfstudio", folder, **changes).load(splits)
+class Capture(Transforms):
+    """The images of a ball, and keys of the file and of its frames."""
 
-
-class Capture:
-    """A capture on disk: the images of a ball, and keys of the file and of its frames."""
+    kind, option, file = NerfstudioSettings, "nerfstudio", "transforms.json"
 
     def __init__(self, path, count=10, **shared):
-        self.path = path
+        super().__init__(path)
         self.views = ball_views(count, 0.6, size=SIZE, angle=ANGLE)
-        self.content = {**PINHOLE, "aabb_scale": 16, **shared, "frames": []}
+        self.contents["train"] = {**PINHOLE, "aabb_scale": 16, **shared, "frames": []}
         for index, pose in enumerate(self.views.camera_to_world.double().tolist()):
             name = f"images/frame_{index:05d}.png"
             # Alpha is 0 or 255: multiplied by it or not, colour is the same.
             save(path / name, self.views.image(index).numpy())
-            self.content["frames"].append({"file_path": name, "transform_matrix": pose})
-
-    @property
-    def frames(self):
-        return self.content["frames"]
-
-    def image(self, index):
-        return self.path / self.frames[index]["file_path"]
+            self.frames().append({"file_path": name, "transform_matrix": pose})
 
     def timed(self, times, key="time"):
-        for frame, time in zip(self.frames, times, strict=True):
-            frame[key] = time
-
-    def renamed(self, new):
-        """Change the names of images in the file, not those of the images."""
-        for frame in self.frames:
-            frame["file_path"] = new(frame["file_path"])
+        for index, time in enumerate(times):
+            self.change(index, **{key: time})
 
     def put(self, name, values):
         """Write an image for each frame, whose stem stands in the name."""
-        for frame in self.frames:
+        for frame in self.frames():
             save(self.path / name.format(Path(frame["file_path"]).stem), values)
-
-    def write(self):
-        (self.path / "transforms.json").write_text(json.dumps(self.content))
-
-    def read(self, splits=("train",), **options):
-        self.write()
-        return read_capture(self.path, splits, **options)
-
-    def train(self, **options):
-        return self.read(**options).splits["train"]
 
     def all(self, **options):
         """All views as one split."""
         return self.train(eval_every=100, **options)
-
-    def refused(self, *words, **options):
-        case, error = options.pop("case", None), options.pop("error", None)
-        how = {"error": error} if error else {}
-        return refused(partial(self.read, **options), *words, case=case, **how)
 
 
 @pytest.fixture
@@ -96,19 +66,6 @@ def capture(tmp_path):
 
 def numbers(views):
     return [int(file[-9:-4]) for file in views.files]
-
-
-def test_a_capture_equals_what_it_was_written_from(capture):
-    capture.timed([i / 9 for i in range(10)])
-    scene = capture.read(("train", "val"))
-    assert scene.name == "ball"
-    parts = scene.splits
-    assert sorted(numbers(parts["train"]) + numbers(parts["val"])) == list(range(10))
-    for views in parts.values():
-        for index, number in enumerate(numbers(views)):
-            assert torch.equal(views.image(index), capture.views.image(number))
-            assert views.times[index] == pytest.approx(number / 9)
-            assert_same_rays(views, index, capture.views, number)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +92,7 @@ def test_a_capture_equals_what_it_was_written_from(capture):
 def test_lenses_as_programs_write_them(tmp_path, keys, model, expected):
     expected = expected or {key: value for key, value in keys.items() if key[0] in "kp"}
     capture = Capture(tmp_path, 3, **keys)
-    capture.frames[2]["k1"] = 0.02  # One frame tells a lens of its own.
+    capture.change(2, k1=0.02)  # One frame tells a lens of its own.
     for resolution in (None, 8):
         lenses = capture.all(resolution=resolution).intrinsics.lenses
         assert lenses.model.tolist() == [LensModel[model]] * 3
@@ -161,9 +118,8 @@ def test_frames_are_held_out_at_even_ranks_of_time(capture):
     ):
         capture.refused(words, error=MissingSplitError, splits=(split,), eval_every=100)
     # Without times, the names of the files decide.
-    for frame in capture.frames:
-        del frame["time"]
-    capture.frames.reverse()
+    capture.change_each(time=...)
+    capture.frames().reverse()
     assert numbers(capture.read(("val",), eval_every=4).splits["val"]) == [6, 2]
     assert capture.train().is_static
 
@@ -178,27 +134,27 @@ def test_lists_of_file_names_are_the_splits(capture):
     def read(*splits):
         return [numbers(views) for views in capture.read(splits).splits.values()]
 
-    names = [frame["file_path"] for frame in capture.frames]
-    capture.content |= {"train_filenames": names[3:], "test_filenames": [f"./{names[1]}"]}
+    names = [frame["file_path"] for frame in capture.frames()]
+    capture.change(train_filenames=names[3:], test_filenames=[f"./{names[1]}"])
     assert read("train", "test") == [[3, 4, 5, 6, 7, 8, 9], [1]]
     capture.refused("no val split", error=MissingSplitError, splits=("val",))
     assert len(capture.train(views=3)) == 3
-    whole = dict(capture.content)
+    whole = dict(capture.contents["train"])
     # Some tools list the same views for validation as for testing.
-    capture.content |= {"val_filenames": [names[1], names[2]]}
+    capture.change(val_filenames=[names[1], names[2]])
     assert read("val", "test") == [[1, 2], [1]]
     for changes, words in (
         ({"val_filenames": "a"}, "val_filenames is 'a', not a list"),
         ({"val_filenames": ["../x.png"]}, "val_filenames leaves the scene's folder"),
-        ({"train_filenames": []}, "no frames to train on"),
+        ({"val_filenames": ..., "train_filenames": []}, "no frames to train on"),
     ):
-        capture.content = whole | changes
+        capture.change(**changes)
         capture.refused(words)
-    capture.content = whole | {"val_filenames": [names[2], names[3]]}
+    capture.change(**whole, val_filenames=[names[2], names[3]])
     with told("1 of 2 views of val_filenames are in train_filenames"):
         assert read("train", "val") == [[3, 4, 5, 6, 7, 8, 9], [2, 3]]
-    capture.content = whole
-    capture.frames.pop(5)
+    capture.change(val_filenames=...)
+    capture.frames().pop(5)
     with told(r"1 names.*\n.*frame_00005.png is in no frame"):
         assert read("train") == [[3, 4, 6, 7, 8, 9]]
     (capture.path / names[5]).unlink()
@@ -207,8 +163,7 @@ def test_lists_of_file_names_are_the_splits(capture):
 
 
 def test_lists_and_frames_may_spell_a_missing_image_differently(capture):
-    names = [f"./{frame['file_path']}" for frame in capture.frames]
-    capture.content |= {"train_filenames": names}
+    capture.change(train_filenames=[f"./{frame['file_path']}" for frame in capture.frames()])
     capture.image(5).unlink()
     with told("1 of 10 frames are left out"):
         assert numbers(capture.train()) == [0, 1, 2, 3, 4, 6, 7, 8, 9]
@@ -232,8 +187,8 @@ def test_times_from_0_to_1_stay(capture, caplog):
         views = capture.train()
     assert float(views.times.min()) == pytest.approx(0.1)
     assert "mapped" not in caplog.text
-    for frame in capture.frames[4:]:
-        frame["time"] = None
+    for index in range(4, 10):
+        capture.change(index, time=None)
     capture.refused('frame 4.*has no "time", but 4 of 10')
 
 
@@ -264,18 +219,17 @@ def label_masks():
 def test_masks_of_labels_colours_and_alpha_mean_what_they_show(tmp_path, kind):
     capture = Capture(tmp_path, 3)
     label_masks()[kind].save(capture.path / "mask.png")
-    for frame in capture.frames:
-        frame["mask_path"] = "mask.png"
+    capture.change_each(mask_path="mask.png")
     expected = capture.views.image(0) * torch.ones(SIZE, SIZE).tril()[..., None]
     assert torch.equal(capture.all(mask_use="alpha").image(0), expected.byte())
 
 
 def masked(capture, values, ending="png", of=lambda index: True, **options):
     """Give frames a mask of grey values; the others get a black one."""
-    for index, frame in enumerate(capture.frames):
-        frame["mask_path"] = f"masks/{index}.{ending}"
-        path = capture.path / frame["mask_path"]
-        path.parent.mkdir(exist_ok=True)
+    (capture.path / "masks").mkdir(exist_ok=True)
+    for index in range(len(capture.frames())):
+        capture.change(index, mask_path=f"masks/{index}.{ending}")
+        path = capture.path / f"masks/{index}.{ending}"
         Image.fromarray(values if of(index) else 0 * values).save(path, **options)
 
 
@@ -408,10 +362,10 @@ def test_all_masks_of_a_capture_have_one_scale(capture):
 @pytest.mark.parametrize("ending", ["png", "jpg"])
 def test_masks_of_instant_ngp_are_white_where_pixels_are_ignored(capture, ending):
     capture.put("images/dynamic_mask_{}.png", 255 - band())
-    for index, frame in enumerate(capture.frames):
+    for index in range(10):
         path = capture.image(index).with_suffix(f".{ending}")
         save(path, capture.views.image(index)[..., :3].numpy())
-        frame["file_path"] = f"./images/{path.name}"
+        capture.change(index, file_path=f"./images/{path.name}")
     scene = capture.read(eval_every=100)
     assert_shown(scene.splits["train"], band())
     assert scene.notes["masks"].startswith("leave out 25.0% of the pixels. They are taken for pix")
@@ -427,9 +381,9 @@ def test_alpha_beside_images_is_read(capture, name):
 
 def test_a_missing_mask_is_not_the_image_itself(capture):
     capture.put("masks/{}.png", band())
-    for frame in capture.frames:
-        frame["mask_path"] = f"masks/{Path(frame['file_path']).name}"
-    (capture.path / capture.frames[3]["mask_path"]).unlink()
+    for index in range(10):
+        capture.change(index, mask_path=f"masks/frame_{index:05d}.png")
+    (capture.path / "masks/frame_00003.png").unlink()
     with told("1 of 10 frames are left out:(.|\n)*frame 3.*no mask of"):
         assert len(capture.all()) == 9
 
@@ -462,9 +416,8 @@ def test_one_mask_of_all_images_is_no_silhouette(capture):
     masked(capture, disc())
     with pytest.warns(UserWarning, match="Both readings are possible"):
         assert capture.train().ignored is None
-    for frame in capture.frames:
-        del frame["mask_path"]
-    capture.content["mask_path"] = "masks/0.png"
+    capture.change_each(mask_path=...)
+    capture.change(mask_path="masks/0.png")
     assert_shown(capture.train(), disc())
 
 
@@ -475,7 +428,7 @@ def test_a_colour_may_be_transparent(capture, level):
         pixels = capture.views.image(index).numpy()
         pixels = np.where(pixels[..., 3:] > 0, pixels[..., :3].clip(1, 254), level)
         save(capture.image(index), pixels.astype(np.uint8))
-    capture.content["white_transparent" if level else "black_transparent"] = True
+    capture.change(**{"white_transparent" if level else "black_transparent": True})
     found = capture.all()
     assert torch.equal(found.images[..., 3], expected.images[..., 3])
     assert (found.images.short() - expected.images.short()).abs().max() <= 1
@@ -487,47 +440,42 @@ def test_a_colour_may_be_transparent(capture, level):
 def test_a_mark_at_the_start_and_comments_are_read(capture):
     expected = capture.all().camera_to_world
     path = capture.path / "transforms.json"
-    text = json.dumps({"name": "http://x//y,]", "frames": capture.frames}, indent=1)
+    text = json.dumps({"name": "http://x//y,]", "frames": capture.frames()}, indent=1)
     text = text.replace('"frames"', f'/* the\nlens */ {json.dumps(PINHOLE)[1:-1]}, // x\n "frames"')
     path.write_text(text[:-2] + ", # the end\n}", encoding="utf-8-sig")
-    found = read_capture(capture.path, eval_every=100)
+    found = capture.load(eval_every=100)
     assert torch.equal(found.splits["train"].camera_to_world, expected)
-    capture.content["distortion_params"] = [0.1, 0.0, 0.0, 0.0]
+    capture.change(distortion_params=[0.1, 0.0, 0.0, 0.0])
     capture.refused("a list of the 6 numbers k1, k2, k3, k4, p1, p2")
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"])
 def test_a_file_in_another_encoding_is_read(capture, encoding):
     (capture.path / "images").rename(capture.path / "bildér")
-    capture.renamed(lambda name: name.replace("images", "bildér"))
+    capture.change_each(file_path=lambda name: name.replace("images", "bildér"))
     path = capture.path / "transforms.json"
-    path.write_text(json.dumps(capture.content, ensure_ascii=False), encoding=encoding)
-    assert len(read_capture(capture.path).splits["train"]) == 9
-    path.write_bytes(json.dumps(capture.content, ensure_ascii=False).encode("cp1252"))
+    text = json.dumps(capture.contents["train"], ensure_ascii=False)
+    path.write_text(text, encoding=encoding)
+    assert len(capture.load().splits["train"]) == 9
+    path.write_bytes(text.encode("cp1252"))
     with told("not in UTF-8 and is read as Latin-1"):
-        assert len(read_capture(capture.path).splits["train"]) == 9
+        assert len(capture.load().splits["train"]) == 9
 
 
 def test_keys_of_other_programs_change_nothing(capture):
     plain = capture.train()
-    capture.content |= {
-        "applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]],
-        "applied_scale": 3.0,
-        "scale": 0.33,
-        "offset": [0.5, 0.5, 0.5],
-        "ply_file_path": "sparse.ply",
-        "orientation_override": "none",
-        "k3": 0,
-        "camera_angle_x": "?",
-        "rolling_shutter": [0, 0, 0, 0],
-    }
-    for frame in capture.frames:
-        frame |= {"colmap_im_id": 3, "sharpness": 10.0, "mask_path": None, "depth_file_path": "x"}
+    capture.change(
+        applied_transform=[[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]],
+        **{"applied_scale": 3.0, "scale": 0.33, "offset": [0.5, 0.5, 0.5], "k3": 0},
+        **{"ply_file_path": "sparse.ply", "orientation_override": "none", "camera_angle_x": "?"},
+        rolling_shutter=[0, 0, 0, 0],
+    )
+    capture.change_each(colmap_im_id=3, sharpness=10.0, mask_path=None, depth_file_path="x")
     found = capture.train()
     assert torch.equal(found.camera_to_world, plain.camera_to_world)
     assert torch.equal(found.images, plain.images)
     assert torch.equal(found.intrinsics.focal, plain.intrinsics.focal)
-    capture.content["from_na"] = True
+    capture.change(from_na=True)
     capture.refused("from_na=True stands for poses with other axes")
 
 
@@ -550,8 +498,8 @@ def test_keys_of_other_programs_change_nothing(capture):
     ],
 )
 def test_keys_that_are_not_followed_are_told(capture, keys, of_a_frame, words):
-    change(capture.content, keys)
-    capture.frames[2] |= of_a_frame
+    capture.change(**keys)
+    capture.change(2, **of_a_frame)
     with told(words):
         capture.read()
 
@@ -561,19 +509,21 @@ def test_files_of_rays_beside_images_are_told_of(capture):
         (capture.path / "images" / name).write_bytes(b"")
     with told(r"rays in files beside 2 of 10 .*rays_frame_00003\.dat"):
         capture.read()
-    capture.content["enable_ray_loading"] = False
+    capture.change(enable_ray_loading=False)
     with told(None):
         capture.read()
 
 
 def test_what_is_no_capture(tmp_path):
-    Capture(tmp_path / "other").write()
+    capture = Capture(tmp_path / "other")
+    capture.write()
     for name, words in (
         (".", r"holds no transforms\.json\. Such scenes in .*: other\. Set data\.root"),
         ("none", r"none does not exist\. Such scenes in .*: other.*xplanes inspect FOLDER"),
         ("other/images", r"holds no transforms\.json\. Set data\.root and data\.scene"),
     ):
-        refused(partial(read_capture, tmp_path / name), words, case=name)
+        capture.path = tmp_path / name
+        refused(capture.load, words, case=name)
 
 
 # Cameras
@@ -581,8 +531,9 @@ def test_what_is_no_capture(tmp_path):
 
 def test_lenses_and_poses_of_many_cameras_stay_with_their_images(capture):
     """Views taken out, spread and held out keep the lens of their own frame."""
-    for index, frame in enumerate(capture.frames):
-        frame |= {"fl_x": 20.0 + index, "k1": 0.01 * (index + 1), "time": (3 * index % 10) / 10}
+    for index in range(10):
+        keys = {"fl_x": 20.0 + index, "k1": 0.01 * (index + 1), "time": (3 * index % 10) / 10}
+        capture.change(index, **keys)
     parts = capture.read(("train", "val"), eval_every=3, views=4).splits
     for views in parts.values():
         for index, number in enumerate(numbers(views)):
@@ -625,9 +576,8 @@ NOT_SQUARE = "{} of 10 of 10 frames gives pixels that are not square"
     ],
 )
 def test_intrinsics_as_programs_write_them(capture, place, keys, expected, words):
-    change(capture.content, dict.fromkeys(PINHOLE, ...))
-    for entry in [capture.content] if place == "file" else capture.frames:
-        entry |= keys
+    capture.change(**dict.fromkeys(PINHOLE, ...))
+    (capture.change if place == "file" else capture.change_each)(**keys)
     with told(words):
         focal = capture.train().intrinsics.focal[0]
     assert focal.tolist() == pytest.approx(expected)
@@ -635,7 +585,7 @@ def test_intrinsics_as_programs_write_them(capture, place, keys, expected, words
 
 def test_a_vertical_field_of_view_beside_a_focal_length(capture):
     keys = {"w": 2 * SIZE, "h": 2 * SIZE, "fl_x": 2 * FOCAL, "cx": 30.0, "cy": 20.0}
-    change(capture.content, {**keys, "fl_y": ..., "camera_angle_y": FLATTER})
+    capture.change(**keys, fl_y=..., camera_angle_y=FLATTER)
     with told(NOT_SQUARE.format("camera_angle_y")):
         intrinsics = capture.train().intrinsics
     assert intrinsics.focal[0].tolist() == pytest.approx([FOCAL, 1.25 * FOCAL])
@@ -644,7 +594,7 @@ def test_a_vertical_field_of_view_beside_a_focal_length(capture):
 
 @pytest.mark.parametrize("name", ["pinhole_6", 2])
 def test_lenses_of_unknown_names_are_told_of(capture, name):
-    capture.content |= {"camera_model": name, "k1": 0.01}
+    capture.change(camera_model=name, k1=0.01)
     with told(f"camera_model='{str(name).upper()}' is not known"):
         lens = capture.train().intrinsics.lens(0)
     assert float(lens.coefficients[0, 0]) == 0.01
@@ -662,8 +612,8 @@ def test_lenses_of_unknown_names_are_told_of(capture, name):
 )
 def test_poses_as_programs_write_them(capture, write):
     expected = capture.train().camera_to_world
-    for frame in capture.frames:
-        frame |= write(np.array(frame.pop("transform_matrix")))
+    for index, frame in enumerate(capture.frames()):
+        capture.change(index, **write(np.array(frame.pop("transform_matrix"))))
     torch.testing.assert_close(capture.train().camera_to_world, expected, rtol=1e-5, atol=1e-6)
 
 
@@ -675,9 +625,8 @@ def test_a_world_whose_y_axis_is_up_is_turned(capture, keys, setting, is_turned)
     notes = capture.read().notes
     assert notes["up"].startswith("the z axis of the files; the cameras' mean up vector is")
     lying = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-    for frame in capture.frames:
-        frame["transform_matrix"] = (lying @ frame["transform_matrix"]).tolist()
-    capture.content |= keys
+    capture.change_each(transform_matrix=lambda matrix: (lying @ matrix).tolist())
+    capture.change(**keys)
     scene = capture.read(orient=setting)
     up = scene.splits["train"].camera_to_world[:, :3, 1].mean(dim=0)
     assert bool(up[2] > 0.99 * up.norm()) is is_turned
@@ -685,28 +634,28 @@ def test_a_world_whose_y_axis_is_up_is_turned(capture, keys, setting, is_turned)
 
 
 def test_the_up_vector_of_instant_ngp_is_the_worlds(capture):
-    capture.content["up"] = [0.0, 2.0, 0.0]
+    capture.change(up=[0.0, 2.0, 0.0])
     scene = capture.read()
     assert scene.notes["up"] == "(0, 1, 0) of the files, by their key up"
-    stated = np.array([f["transform_matrix"] for f in capture.frames])[:, 1, :3]
+    stated = np.array([f["transform_matrix"] for f in capture.frames()])[:, 1, :3]
     found = scene.splits["train"].camera_to_world[:, 2, :3]
     np.testing.assert_allclose(found.numpy(), stated[numbers(scene.splits["train"])], atol=1e-6)
     assert "mean up vector" in capture.read(orient=False).notes["up"]
-    capture.content["up"] = [0, 0, "z"]
+    capture.change(up=[0, 0, "z"])
     assert "mean up vector" in capture.read().notes["up"]
 
 
 def test_positions_in_map_coordinates_are_read_relative_to_their_mean(capture):
     near = capture.train().camera_to_world
-    for frame in capture.frames:
-        for row, place in zip(frame["transform_matrix"], (691_607, 5_334_760, 520), strict=False):
-            row[3] += place
+    place = np.zeros((4, 4))
+    place[:3, 3] = 691_607, 5_334_760, 520
+    capture.change_each(transform_matrix=lambda matrix: (matrix + place).tolist())
     with told(r"relative to \(691606, 5334760, 522\)"):
         shift = (capture.train().camera_to_world - near)[:, :3]
     torch.testing.assert_close(shift[..., :3], torch.zeros(9, 3, 3))
     torch.testing.assert_close(shift, shift[:1].expand_as(shift), atol=1e-5, rtol=0)
     assert float(shift.abs().max()) < 5
-    capture.frames[0]["transform_matrix"][0][3] = 1e30
+    capture.frames()[0]["transform_matrix"][0][3] = 1e30
     capture.refused("which single precision cannot resolve")
 
 
@@ -720,7 +669,7 @@ def test_smaller_copies_stand_in_for_images_that_are_missing(capture):
         found = capture.train(resolution=12)
     assert found.files[0].startswith("images_4/")
     assert_same_rays(found, 1, whole, 1)
-    change(capture.content, {"w": ..., "h": ...})
+    capture.change(w=..., h=...)
     capture.refused("no image .*images/frame_00000", error=MissingSplitError)
 
 
@@ -728,21 +677,21 @@ def test_images_elsewhere_or_one_folder_deeper(capture):
     expected = capture.train().files
     images, elsewhere = capture.path / "images", capture.path.parent / "elsewhere"
     images.rename(elsewhere)
-    capture.renamed(lambda name: str(elsewhere / Path(name).name))
+    capture.change_each(file_path=lambda name: str(elsewhere / Path(name).name))
     capture.refused(r"leaves the scene's folder .*Put a link to \S*elsewhere inside the folder")
     images.mkdir()
     elsewhere.rename(images / "images")
-    capture.renamed(lambda name: f"images/{Path(name).name}")
+    capture.change_each(file_path=lambda name: f"images/{Path(name).name}")
     assert capture.train().files == tuple(f"images/{file}" for file in expected)
 
 
 def test_a_percent_encoded_name_is_read(capture):
     (capture.path / "images").rename(capture.path / "my images")
-    capture.renamed(lambda name: name.replace("images", "my%20images"))
+    capture.change_each(file_path=lambda name: name.replace("images", "my%20images"))
     assert len(capture.train()) == 9
     name = "my images/frame%200.png"
     (capture.path / "my images/frame_00000.png").rename(capture.path / name)
-    capture.frames[0]["file_path"] = name  # A file of exactly this name comes first.
+    capture.change(0, file_path=name)  # A file of exactly this name comes first.
     assert len(capture.train()) == 9
 
 
@@ -761,7 +710,7 @@ def test_images_are_found_by_names_that_are_nearly_theirs(capture, new):
     for index in range(10):
         path = capture.image(index)
         path.rename(path.with_name(f"é{path.name}"))
-    capture.renamed(lambda name: new(name.replace("/", "/é")))
+    capture.change_each(file_path=lambda name: new(name.replace("/", "/é")))
     assert len(capture.all()) == 10
 
 

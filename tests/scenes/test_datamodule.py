@@ -35,11 +35,13 @@ def take(module, count):
     return [next(stream) for _ in range(count)]
 
 
-def test_batches_are_those_of_the_steps_in_order():
-    for rank in (0, 1):
-        module, batches = module_of(rank=rank)
+@pytest.mark.parametrize("rank", [0, 1])
+def test_batches_are_those_of_the_steps_in_order(rank):
+    module, batches = module_of(rank=rank)
+    for again in (False, True):  # Another module begins with the first batch.
         for step, batch in enumerate(take(module, 4)):
-            assert same(batch, batches(rank).draw(step)), (rank, step)
+            assert same(batch, batches(rank).draw(step)), (again, step)
+        module.setup("fit")
 
 
 def test_a_resumed_run_draws_what_an_uninterrupted_one_would():
@@ -63,13 +65,6 @@ def test_passes_over_the_loader_follow_one_another():
     assert same(second, batches(0).draw(1))
     views = module.scene.splits["train"]
     assert len(loader) == len(views) * views.height * views.width // RAYS.per_batch
-
-
-def test_another_module_begins_with_the_first_batch():
-    module, batches = module_of()
-    take(module, 3)
-    module.setup("fit")
-    assert same(take(module, 1)[0], batches(0).draw(0))
 
 
 def test_no_rays_of_held_out_views_are_trained_on():
@@ -98,28 +93,18 @@ def test_held_out_views_of_one_camera_are_spread_evenly():
     assert held_out_places([0.0], 8) == []
 
 
-def test_the_video_does_not_show_what_is_held_out():
+def test_neither_the_video_nor_other_views_show_what_is_held_out():
     scene = ball_scene(count=16)
     train = scene.splits["train"]
-    data = SceneDataModule.of(replace(scene, video=train))
+    data = SceneDataModule.of(replace(scene, video=train, lrm_views=train))
     data.setup("fit")
-    video = data.scene.video
-    assert video is not None
-    assert set(video.files) == set(data.scene.splits["train"].files)
-
-
-def test_nothing_shows_what_is_held_out_if_all_of_it_is():
-    scene = ball_scene(count=16)
-    train = scene.splits["train"]
-    data = SceneDataModule.of(scene)
+    splits = data.scene.splits
+    assert list(data.scene.video.files) == list(splits["train"].files)
+    assert list(data.scene.lrm_views.files) == list(splits["train"].files)
+    held_out = [index for index, file in enumerate(train.files) if file in splits["val"].files]
+    data = SceneDataModule.of(replace(scene, video=train.subset(torch.tensor(held_out))))
     data.setup("fit")
-    held_out = set(data.scene.splits["val"].files)
-    places = torch.tensor([i for i, file in enumerate(train.files) if file in held_out])
-    data = SceneDataModule.of(replace(scene, video=train.subset(places), lrm_views=train))
-    data.setup("fit")
-    assert data.scene.video is None
-    assert data.scene.lrm_views is not None
-    assert list(data.scene.lrm_views.files) == list(data.scene.splits["train"].files)
+    assert data.scene.video is None, "all of it is held out"
 
 
 def test_as_many_views_are_held_out_as_are_scored_at_most():

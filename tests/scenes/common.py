@@ -47,6 +47,11 @@ def assert_same_rays(views, index, other, place, atol=1e-5):
         torch.testing.assert_close(mine, theirs, atol=atol, rtol=0)
 
 
+def keys_of(value):
+    """Names cases by the keys that they are about."""
+    return " ".join(value) if isinstance(value, dict) else None
+
+
 def rgba(seed, width=12, height=None):
     """Straight colour with soft and fully transparent parts. uint8 [height, width, 4]"""
     height = height or width

@@ -350,16 +350,6 @@ def test_a_lens_that_folds_inside_its_images(scene):
 # Masks
 
 
-def test_masks_of_a_car_bonnet_are_ignored(scene):
-    mask = np.full((12, 12), 255, np.uint8)
-    mask[9:] = 0
-    save(scene.path / "train" / "bonnet.png", mask)
-    scene.change_each(mask_path="train/bonnet.png")
-    views = scene.train()
-    assert views.ignored[:, 9:].all()
-    assert not views.ignored[:, :9].any()
-
-
 def test_masks_become_alpha(scene):
     grey = np.zeros((12, 12), np.uint8)
     grey[:, 3:] = 255

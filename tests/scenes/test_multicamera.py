@@ -127,6 +127,10 @@ def read(folder: Path, splits=("train", "test"), **options):
     return settings(MultiCameraSettings, "multicamera", folder, **options).load(splits)
 
 
+def refuse(folder: Path, words: str, error: type[Exception] = SceneError, **options) -> None:
+    refused(partial(read, folder, **options), words, case=(words, options), error=error)
+
+
 def require_rays_of(found: Views, indices: list[int]) -> None:
     expected = VIEWS.subset(torch.tensor(indices))
     assert len(found) == len(expected)
@@ -220,9 +224,9 @@ def test_colmap_may_have_registered_an_image_of_each_camera(images, name, text):
 def test_images_and_cameras_that_do_not_belong_together(copied):
     (copied / "poses_bounds.npy").unlink()
 
-    def refuse(words: str, name: str | Callable[[int], str], **changes) -> None:
+    def refuse_model(words: str, name: str | Callable[[int], str], **changes) -> None:
         with_colmap(copied, name, **changes)
-        refused(partial(read, copied), words)
+        refuse(copied, words)
 
     plain = "cam{:02d}.png"
     both = r"images\.bin: {}.*Registered images: {}.*cam\*, in .*copied: cam00\.mp4, cam01\.mp4"
@@ -230,21 +234,23 @@ def test_images_and_cameras_that_do_not_belong_together(copied):
     with_colmap(copied, plain)
     assert len(read_cameras(copied)) == CAMERAS
     left = r"left0\.png, left1\.png, left2\.png, left3\.png"
-    refuse(both.format("left0.png may be of no video or folder", left), "left{}.png")
-    refuse(
+    refuse_model(both.format("left0.png may be of no video or folder", left), "left{}.png")
+    refuse_model(
         both.format("cam00/1.png, cam00/2.png, .* belongs to cam00.mp4", "cam00/1.png"),
         lambda camera: f"cam00/{camera + 1}.png",
     )
     three = r"cam00\.png, cam01\.png, cam02\.png\. "
-    refuse(both.format("no registered image belongs to cam03.mp4", three), plain, cameras=3)
-    refuse(r"cam00\.mp4 has 48x48 pixels, but .* 96x48, of another aspect", plain, height=SIZE)
+    refuse_model(both.format("no registered image belongs to cam03.mp4", three), plain, cameras=3)
+    refuse_model(
+        r"cam00\.mp4 has 48x48 pixels, but .* 96x48, of another aspect", plain, height=SIZE
+    )
     (copied / "cam02.mov").write_bytes(b"")
-    refuse(r"cam02\.png may be of cam02\.mov or of cam02\.mp4", plain)
+    refuse_model(r"cam02\.png may be of cam02\.mov or of cam02\.mp4", plain)
     (copied / "cam02.mov").unlink()
     (copied / "0001").mkdir()
-    refuse("cam00/0001.png may be of 0001 or of cam00", "cam{:02d}/0001.png")
+    refuse_model("cam00/0001.png may be of 0001 or of cam00", "cam{:02d}/0001.png")
     (copied / "sparse" / "0" / "images.bin").unlink()
-    refused(partial(read, copied), r"holds neither images\.bin nor images\.txt")
+    refuse(copied, r"holds neither images\.bin nor images\.txt")
 
 
 def test_frames_by_range_and_stride(videos):
@@ -272,7 +278,7 @@ def test_the_video_is_that_of_a_training_camera(videos):
     assert read(videos, splits=("train",), video_camera="cam03").video.files[0][:5] == "cam03"
     for name in ("cam00", "cam9"):
         words = f"video_camera={name} is not a training camera.*must not see.*cam01, cam02"
-        refused(partial(read, videos, video_camera=name), words)
+        refuse(videos, words, video_camera=name)
 
 
 def test_large_captures_are_kept_on_disk(videos, tmp_path, monkeypatch, capsys):
@@ -324,7 +330,7 @@ def test_cameras_of_different_lengths_and_rates(copied, caplog):
     assert len(train) == 3 * 4
     assert train.times[:4].tolist() == pytest.approx([0, 1 / 3, 2 / 3, 1])
     words = r"cam02\.mp4 has 4 frames.*data\.frames=\[0,3,1\]"
-    refused(partial(read, copied, frames=[0, 5, 1]), words)
+    refuse(copied, words, frames=[0, 5, 1])
     write_video(copied / "cam02.mp4", rgb(2), rate=25)
     train = read(copied).splits["train"]
     assert [file[:5] for file in train.files[::FRAMES]] == ["cam01", "cam02", "cam03"]
@@ -334,7 +340,7 @@ def test_cameras_of_different_lengths_and_rates(copied, caplog):
 
 
 @pytest.mark.parametrize("apart", [0, 100])
-@pytest.mark.parametrize("gone", [[FRAMES - 1], [2], [0], [1, FRAMES - 1]])
+@pytest.mark.parametrize("gone", [[FRAMES - 1], [2], [0], [1, FRAMES - 1]], ids=str)
 def test_a_frame_that_one_camera_lacks_is_left_out(images, apart, gone):
     for camera in range(CAMERAS):  # Cameras may have their own numbers for the same timestep.
         for path in sorted((images / f"cam{camera:02d}").iterdir(), key=lambda p: int(p.stem)):
@@ -356,7 +362,7 @@ def test_images_that_are_missing_beside_videos(images):
     write_video(images / "cam03.mp4", rgb(3))
     shutil.rmtree(images / "cam03")
     (images / "cam02" / "7.png").unlink()
-    refused(partial(read, images), r"numbers of cam00/7\.png, cam01/7\.png\. Add what is")
+    refuse(images, r"numbers of cam00/7\.png, cam01/7\.png\. Add what is")
 
 
 def test_folders_beside_cameras_are_none(images):
@@ -365,25 +371,34 @@ def test_folders_beside_cameras_are_none(images):
     require_all(read(images))
 
 
-def test_damaged_files_are_named(copied):
-    poses = np.load(copied / "poses_bounds.npy")
+@pytest.mark.parametrize(
+    ("words", "error", "options"),
+    [
+        (r"no split val: its splits are train, test", MissingSplitError, {"splits": ("val",)}),
+        (r"has no split test", MissingSplitError, {"test_cameras": []}),
+        (r"no camera cam7\. Its cameras are cam00, cam01", SceneError, {"test_cameras": ["cam7"]}),
+        (r"leaves no camera", SceneError, {"test_cameras": [f"cam0{i}" for i in range(4)]}),
+    ],
+)
+def test_splits_and_cameras_that_are_not_there(videos, words, error, options):
+    refuse(videos, words, error=error, **options)
 
-    def refuse(words: str, error: type[Exception] = SceneError, **options) -> None:
-        refused(partial(read, copied, **options), words, error=error)
 
-    refuse(r"has no split val: its splits are train, test", MissingSplitError, splits=("val",))
-    refuse(r"has no split test", MissingSplitError, test_cameras=[])
-    refuse(r"no camera cam7\. Its cameras are cam00, cam01", test_cameras=["cam7"])
-    refuse(r"leaves no camera", test_cameras=[f"cam0{i}" for i in range(4)])
-    content = (copied / "cam01.mp4").read_bytes()
-    (copied / "cam01.mp4").write_bytes(content[: len(content) // 2])
-    refuse(r"cam01\.mp4.*(truncated|damaged)")
-    (copied / "cam01.mp4").write_bytes(b"no video")
-    refuse(r"cam01\.mp4 cannot be decoded as a video")
-    (copied / "cam01.mp4").unlink()
-    refuse(r"has 4 cameras, but .* holds 3 .*: cam00\.mp4, cam02\.mp4")
-    (copied / "cam01.mp4").write_bytes(content)
-    for column, value, match in (
+def test_damaged_and_missing_videos_are_named(copied):
+    path = copied / "cam01.mp4"
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    refuse(copied, r"cam01\.mp4.*(truncated|damaged)")
+    path.write_bytes(b"no video")
+    refuse(copied, r"cam01\.mp4 cannot be decoded as a video")
+    path.unlink()
+    refuse(copied, r"has 4 cameras, but .* holds 3 .*: cam00\.mp4, cam02\.mp4")
+
+
+def test_rows_of_poses_that_cannot_be(images):
+    path = images / "poses_bounds.npy"
+    poses = np.load(path)
+    for column, value, words in (
         (4, 0.0, "row 2 .*height is 0"),
         (14, np.nan, "focal length is nan"),
         (0, 3.0, "row 2 .*orthonormal"),
@@ -391,36 +406,36 @@ def test_damaged_files_are_named(copied):
     ):
         spoilt = poses.copy()
         spoilt[2, column] = value
-        np.save(copied / "poses_bounds.npy", spoilt)
-        refuse(match)
-    np.save(copied / "poses_bounds.npy", poses[:, :16])
-    refuse(r"not one row of 17 numbers")
-    np.save(copied / "poses_bounds.npy", np.array([{}]), allow_pickle=True)
-    refuse(r"poses_bounds\.npy cannot be read")
+        np.save(path, spoilt)
+        refuse(images, words)
+    np.save(path, poses[:, :16])
+    refuse(images, r"not one row of 17 numbers")
+    np.save(path, np.array([{}]), allow_pickle=True)
+    refuse(images, r"poses_bounds\.npy cannot be read")
+
+
+def test_places_of_recordings_that_cannot_be(copied):
     (copied / "poses_bounds.npy").unlink()
-    refuse(r"neither poses_bounds\.npy .* nor transforms\.json .*cam00\.mp4")
-    for name, match in (
+    refuse(copied, r"neither poses_bounds\.npy .* nor transforms\.json .*cam00\.mp4")
+    (copied / "cam00").mkdir()
+    for name, words in (
         ("cam05.mp4", "is not a video"),
         ("../other", "leaves the scene's folder"),
         ("/cam05.mp4", "is not a video"),
         ("", "must be text"),
         (".", "is the scene's folder"),
+        (lambda camera: f"cam{camera:02d}.mp4" if camera else "cam00", "cam00 holds no images"),
+        ("cam01.mp4", r"another pose than .* data=nerfstudio"),
     ):
         with_transforms(copied, name)
-        refuse(match)
-    (copied / "cam00").mkdir()
-    with_transforms(copied, lambda camera: f"cam{camera:02d}.mp4" if camera else "cam00")
-    refuse(r"cam00 holds no images")
-    with_transforms(copied, "cam01.mp4")
-    refuse(r"another pose than .* data=nerfstudio")
+        refuse(copied, words)
 
 
 def test_cameras_of_images_need_no_pyav(images, monkeypatch, videos):
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     assert len(read_cameras(images)) == CAMERAS
     require_all(read(images))
-    words = r'pip install "xplanes\[video\]"'
-    refused(partial(read, videos), words, error=MissingExtraError)
+    refuse(videos, r'pip install "xplanes\[video\]"', error=MissingExtraError)
 
 
 def test_frames_that_an_edit_list_hides_are_not_counted(tmp_path):

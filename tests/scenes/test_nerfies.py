@@ -68,9 +68,8 @@ def test_the_smallest_images_that_are_large_enough(capture):
         assert views.width == (resolution or WIDTH)
     full, half = (read(capture, "train", resolution=n).splits["train"] for n in (None, 20))
     for name in ("focal", "centre"):
-        torch.testing.assert_close(
-            getattr(half.intrinsics, name), getattr(full.intrinsics, name) / 2
-        )
+        whole = getattr(full.intrinsics, name)
+        torch.testing.assert_close(getattr(half.intrinsics, name), whole / 2)
     torch.testing.assert_close(half.intrinsics.lenses.skew, full.intrinsics.lenses.skew / 2)
     # Rays through the corners of four pixels are those through the middle of one.
     corners = full.image_rays(0)[1].view(HEIGHT, WIDTH, 3)
@@ -100,15 +99,14 @@ def test_which_key_counts_time(capture):
     warped = times()
     for place, entry in enumerate(capture.metadata.values()):
         entry["time_id"] = place**2
-    capture.write("metadata.json", capture.metadata)
-    assert times() == pytest.approx([0, 4 / 25, 16 / 25])
-    capture.metadata["000003"].pop("time_id")
-    capture.write("metadata.json", capture.metadata)
-    assert times() == warped
-    capture.metadata["000003"].pop("warp_id")
-    capture.write("metadata.json", capture.metadata)
-    assert times() == pytest.approx([0, 0.4, 0.8])
-    capture.metadata["000003"].pop("appearance_id")
+    for key, expected in (
+        ("time_id", [0, 4 / 25, 16 / 25]),
+        ("warp_id", warped),
+        ("appearance_id", [0, 0.4, 0.8]),
+    ):
+        capture.write("metadata.json", capture.metadata)
+        assert times() == pytest.approx(expected)
+        capture.metadata["000003"].pop(key)
     capture.write("metadata.json", capture.metadata)
     refused(capture, r"metadata\.json: not all images have one of .*data\.static=true")
     assert read(capture, static=True).splits["train"].times.tolist() == [0, 0, 0]

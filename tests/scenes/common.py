@@ -1,4 +1,4 @@
-"""What tests of several formats share: refusals in several words, warnings, rays, transforms."""
+"""What tests of several readers share: refusals, warnings, captures, and rays into known pixels."""
 
 import json
 import math
@@ -145,15 +145,6 @@ def stored(views):
     return replace(views, images=StoredImages.all_of(file))
 
 
-def padded(images):
-    """Images in one tensor, zeros at the bottom and on the right. [h, w, 4] each -> [V, H, W, 4]"""
-    height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
-    whole = torch.zeros(len(images), height, width, 4, dtype=torch.uint8)
-    for place, image in zip(whole, images, strict=True):
-        place[: image.shape[0], : image.shape[1]] = image
-    return whole
-
-
 def numbered(views):
     """The same views, opaque: pixels hold their view, row and column, and padding 255."""
     images = torch.full((len(views), views.height, views.width, 4), 255, dtype=torch.uint8)
@@ -162,15 +153,19 @@ def numbered(views):
     return replace(views, images=images)
 
 
-def drawn_in(batch, views):
-    """View, row and column of rays into numbered views, which are their pixels' own rays."""
-    view, row, column = (255 * batch["target"]).round().long().T
+def places_of(batch):
+    """View, row and column of rays into numbered views."""
+    return tuple((255 * batch["target"]).round().long().T)
+
+
+def assert_own_rays(batch, views):
+    """Rays into numbered views are those of the pixels whose colours they have."""
+    view, row, column = places_of(batch)
     for index in range(len(views)):
         own = view == index
         expected = views.image_rays(index)[1][row[own] * views.size(index)[1] + column[own]]
         torch.testing.assert_close(batch["directions"][own], expected, atol=1e-5, rtol=0)
         assert (batch["times"][own] == views.times[index]).all()
-    return view, row, column
 
 
 def drawn_pixels(batches, steps):
@@ -179,9 +174,8 @@ def drawn_pixels(batches, steps):
     counts = torch.zeros(len(views), views.height, views.width)
     for step in range(steps):
         batch = batches.draw(step)
-        places = tuple((255 * batch["target"]).round().long().T)
-        counts.index_put_(places, torch.ones(len(batch["target"])), accumulate=True)
-    drawn_in(batch, views)
+        counts.index_put_(places_of(batch), torch.ones(len(batch["times"])), accumulate=True)
+    assert_own_rays(batch, views)
     return counts
 
 

@@ -334,9 +334,11 @@ def test_images_of_another_shape(capture):
 # Times
 
 
-def test_times_are_the_last_numbers_in_names(tmp_path):
+def test_times_are_the_last_numbers_in_names(tmp_path, caplog):
     capture = Capture(tmp_path / "room", ["c2_010.png", "c1_020.png", "c1_060.png"])
-    assert capture.views().times.tolist() == pytest.approx([0.2, 1, 0])
+    with caplog.at_level("INFO"):
+        assert capture.views().times.tolist() == pytest.approx([0.2, 1, 0])
+    assert "the numbers in their names, from 10 to 60" in caplog.text
     assert capture.read("train").notes["times"] == (
         "the numbers in their names, from 10 to 60: c1_020.png -> 20, c1_060.png -> 60, "
         "c2_010.png -> 10"

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.balls import ball_views
-from tests.scenes.common import drawn_in, numbered, same
+from tests.scenes.common import assert_own_rays, numbered, same
 from tests.scenes.test_batches import VIEWS, batches_of
 from xplanes.scenes import importance
 from xplanes.scenes.importance import (
@@ -103,7 +103,8 @@ def test_rays_are_drawn_where_errors_are_large_as_a_function_of_the_step():
 
 def test_preferred_pixels_have_their_own_colours_and_rays():
     views = numbered(VIEWS)
-    drawn_in(batches_of(views, error_share=0.5).draw(2, 200, map_of({0: 1.0})), views)
+    batch = batches_of(views, error_share=0.5).draw(2, 200, map_of({0: 1.0}))
+    assert_own_rays(batch, views)
 
 
 @pytest.fixture

@@ -18,7 +18,6 @@ from tests.scenes.common import (
     assert_same_rays,
     drawn_pixels,
     numbered,
-    padded,
     refused,
     rgba,
     same,
@@ -39,6 +38,15 @@ RADIUS = 0.5
 # Height, width, focal lengths along x and y, principal point from the left and from the top.
 WIDE = (30, 44, 41.0, 36.5, 25.25, 13.5)
 UPRIGHT = (38, 26, 55.0, 58.0, 12.0, 21.75)
+
+
+def padded(images):
+    """Images in one tensor, zeros at the bottom and on the right. [h, w, 4] each -> [V, H, W, 4]"""
+    height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
+    whole = torch.zeros(len(images), height, width, 4, dtype=torch.uint8)
+    for place, image in zip(whole, images, strict=True):
+        place[: image.shape[0], : image.shape[1]] = image
+    return whole
 
 
 def rays_of(pose, height, width, focal_x, focal_y, centre_x, centre_y):

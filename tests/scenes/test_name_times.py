@@ -65,11 +65,11 @@ def test_times_that_are_hardly_those_of_the_images_are_shown(names, words):
 @pytest.mark.parametrize(
     ("names", "words"),
     [
-        (["left.png", "right.png"], "have no number, such as left"),
-        ([f"{name}.png" for name in "3f2a9c b07d1e 9e4410 c5a8f2 77e0b3 0d1f6a".split()], "differ"),
-        (["a_1.png", "b_1.png"], "give one number"),
+        ("left right", "have no number, such as left"),
+        ("3f2a9c b07d1e 9e4410 c5a8f2 77e0b3 0d1f6a", "differ in more than their numbers"),
+        ("a_1 b_1", "all 2 images, such as a_1.png, give one number"),
     ],
 )
 def test_names_without_an_order_are_one_timestep(names, words):
     with pytest.warns(UserWarning, match=f"{words}(.|\n)*one timestep.*data.static=true"):
-        assert times_in_names(names) == []
+        assert times_in_names([f"{name}.png" for name in names.split()]) == []

@@ -113,11 +113,11 @@ def test_frames_are_held_out_at_even_ranks_of_time(capture):
         ranks = [sorted((10 * views.times).round().tolist()) for views in splits.values()]
         assert ranks == [[rank for rank in range(10) if rank not in expected], expected]
     assert len(capture.all()) == 10
-    for split, words in (
-        ("val", r"no val split.*data\.eval_every=100"),
-        ("test", r"no test split.*Splits of this capture: train.*data\.eval_split"),
+    for split, every, words in (
+        ("val", 100, r"no val split.*data\.eval_every=100"),
+        ("test", 8, r"no test split.*Splits of this capture: train, val.*data\.eval_split"),
     ):
-        capture.refused(words, error=MissingSplitError, splits=(split,), eval_every=100)
+        capture.refused(words, error=MissingSplitError, splits=(split,), eval_every=every)
     # Without times, the names of the files decide.
     capture.change_each(time=...)
     capture.frames().reverse()

@@ -1,19 +1,20 @@
-"""Ray batches: a function of seed, step and rank, and right in every pixel."""
+"""Ray batches: a function of seed, step and rank, right in every pixel, alike on all devices."""
 
 import itertools
 from dataclasses import replace
-from itertools import product
 
 import pytest
 import torch
 
+from tests import fake_device
 from tests.balls import RAYS, ball_views
-from tests.oracles import project
+from tests.scenes.common import assert_even, same
 from xplanes.errors import ConfigError
-from xplanes.scenes.batches import NEAR_SILHOUETTE, RayBatches
+from xplanes.scenes.batches import NEAR_SILHOUETTE, DeviceBatches, RayBatches
 from xplanes.scenes.frame import Frame, cube_frame
+from xplanes.scenes.importance import MOST_TILES
 from xplanes.scenes.silhouettes import foreground, textureless
-from xplanes.streams import step_generator
+from xplanes.streams import counted_uniform, step_generator
 
 SQUARE = ball_views(5, 0.5, size=24)
 FOCAL = float(SQUARE.intrinsics.focal[0, 0])
@@ -25,20 +26,17 @@ def batches_of(views=VIEWS, frame=FRAME, *, seed=0, rank=0, **options):
     return RayBatches(views, frame, replace(RAYS, **options), seed=seed, rank=rank)
 
 
-def same(first, second):
-    assert first.keys() == second.keys()
-    return all(torch.equal(first[name], second[name]) for name in first)
-
-
-def test_a_batch_depends_on_its_step_alone():
-    for background in ("white", "random"):
-        fresh, used = batches_of(background=background), batches_of(background=background)
-        for step in (0, 17, 3, 10**9):
-            used.draw(step)
-        torch.manual_seed(5)
-        torch.rand(100)
-        for step in (0, 1, 17, 10**9):
-            assert same(fresh.draw(step), used.draw(step)), (background, step)
+@pytest.mark.parametrize("background", ["white", "random"])
+def test_a_batch_depends_on_its_step_alone(background):
+    fresh, used = batches_of(background=background), batches_of(background=background)
+    for step in (0, 17, 3, 10**9):
+        used.draw(step)
+    torch.manual_seed(5)
+    torch.rand(100)
+    state = torch.get_rng_state()
+    for step in (0, 1, 17, 10**9):
+        assert same(fresh.draw(step), used.draw(step)), step
+    assert torch.equal(torch.get_rng_state(), state), "other numbers are drawn"
 
 
 def test_steps_ranks_and_seeds_draw_different_rays():
@@ -49,13 +47,6 @@ def test_steps_ranks_and_seeds_draw_different_rays():
     for first, second in itertools.combinations(drawn, 2):
         assert not torch.equal(first["jitter"], second["jitter"])
         assert not torch.equal(first["directions"], second["directions"])
-
-
-def test_drawing_does_not_touch_the_global_generator():
-    torch.manual_seed(0)
-    before = torch.get_rng_state()
-    batches_of(background="random").draw(4)
-    assert torch.equal(before, torch.get_rng_state())
 
 
 def test_neighbouring_generators_share_nothing():
@@ -72,47 +63,42 @@ def test_neighbouring_generators_share_nothing():
     assert abs(float(first.mean()) - 0.5) < 0.02
 
 
-def pixels_of(batch, views, frame):
-    """View, row and column of each ray, found by projecting a point of it into every view."""
-    found = []
-    origins, points = (
-        frame.to_world(p) for p in (batch["origins"], batch["origins"] + batch["directions"])
-    )
-    for origin, point, time in zip(origins, points, batch["times"], strict=True):
-        (view,) = (views.times == time).nonzero().flatten().tolist()
-        pose = views.camera_to_world[view]
-        torch.testing.assert_close(origin, pose[:3, 3], atol=1e-5, rtol=0)
-        row, column, ok = project(
-            point.double().numpy(), pose.double().numpy(), FOCAL, views.height, views.width
-        )
-        assert ok
-        found.append((view, row, column))
-    return torch.tensor(found).T
+def pixels_of(batch, views, frame=FRAME):
+    """View, row and column of each ray: its camera's, and where it passes the image plane."""
+    cameras = views.camera_to_world.double()
+    origins = frame.to_world(batch["origins"])
+    away = torch.cdist(origins.double(), cameras[:, :3, 3])
+    assert away.amin(dim=1).max() < 1e-5
+    view = away.argmin(dim=1)
+    directions = (frame.to_world(batch["origins"] + batch["directions"]) - origins).double()
+    right, up, back = (directions[:, None] @ cameras[view, :3, :3])[:, 0].T
+    row = -up / -back * FOCAL + views.height / 2
+    column = right / -back * FOCAL + views.width / 2
+    return view, row.floor().long(), column.floor().long()
 
 
-def test_targets_are_the_pixels_that_the_rays_go_through():
-    colours = torch.randint(
-        0, 256, VIEWS.images.shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8
-    )
+TURNED = Frame(0.3, torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), torch.ones(3))
+
+
+@pytest.mark.parametrize("background", ["white", "random"])
+@pytest.mark.parametrize("frame", [FRAME, TURNED], ids=["plain frame", "turned frame"])
+def test_targets_are_the_pixels_that_the_rays_go_through(background, frame):
+    generator = torch.Generator().manual_seed(0)
+    colours = torch.randint(0, 256, VIEWS.images.shape, generator=generator, dtype=torch.uint8)
     colours[..., :3] = torch.minimum(colours[..., :3], colours[..., 3:])  # multiplied by alpha
-    views = VIEWS.__class__(colours, VIEWS.camera_to_world, VIEWS.times, FOCAL, VIEWS.files)
-    turned = Frame(0.3, torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), torch.ones(3))
-    for background, frame in product(("white", "random"), (FRAME, turned)):
-        case = f"{background} background, frame of scale {frame.scale}"
-        batch = batches_of(views, frame, background=background).draw(3)
-        view, row, column = pixels_of(batch, views, frame)
-        pixel = colours[view, row, column].double() / 255
-        expected = pixel[:, :3] + (1 - pixel[:, 3:]) * batch["background"].double()
-        assert (batch["target"].double() - expected).abs().max() < 1e-6, case
-        torch.testing.assert_close(batch["directions"].norm(dim=-1), torch.ones(64))
-        assert torch.equal(batch["times"], views.times[view]), case
-        white = (batch["background"] == 1).all()
-        assert white == (background == "white"), case
-        for index in range(len(views)):
-            image = views.composite(index, torch.ones(3))
-            assert not white or torch.allclose(
-                batch["target"][view == index], image[row[view == index], column[view == index]]
-            ), case
+    views = replace(VIEWS, images=colours)
+    batch = batches_of(views, frame, background=background).draw(3)
+    view, row, column = pixels_of(batch, views, frame)
+    pixel = colours[view, row, column].double() / 255
+    expected = pixel[:, :3] + (1 - pixel[:, 3:]) * batch["background"].double()
+    assert (batch["target"].double() - expected).abs().max() < 1e-6
+    torch.testing.assert_close(batch["directions"].norm(dim=-1), torch.ones(64))
+    assert torch.equal(batch["times"], views.times[view])
+    white = bool((batch["background"] == 1).all())
+    assert white == (background == "white")
+    if white:
+        images = torch.stack([views.composite(i, torch.ones(3)) for i in range(len(views))])
+        torch.testing.assert_close(batch["target"], images[view, row, column])
 
 
 def test_one_background_is_shared_by_a_batch_and_changes_between_batches():
@@ -126,48 +112,26 @@ def test_one_background_is_shared_by_a_batch_and_changes_between_batches():
     assert torch.equal(first["target"][empty], first["background"][empty])
 
 
-def near_share(batches, steps=40):
-    """Share of drawn rays near the silhouettes."""
-    views = batches.views
-    margin = max(1, round(NEAR_SILHOUETTE * views.width))
-    near = foreground(views, margin)
-    found = []
-    for step in range(steps):
-        view, row, column = pixels_of(batches.draw(step), views, FRAME)
-        found.append(near[view, row, column])
-    return float(torch.cat(found).float().mean()), float(near.float().mean())
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.4])
+def test_the_share_of_background_rays_is_the_asked_one(share):
+    batches = batches_of(background_share=share, per_batch=2000)
+    near = foreground(VIEWS, max(1, round(NEAR_SILHOUETTE * VIEWS.width)))
+    drawn = float(near[pixels_of(batches.draw(0), VIEWS)].float().mean())
+    assert drawn == pytest.approx(1 - share, abs=4 * (share * (1 - share) / 2000) ** 0.5)
+    natural = float(near.float().mean())
+    assert batches.skipped == pytest.approx(1 - natural - share)
 
 
-def test_the_share_of_background_rays_is_the_asked_one():
-    for share in (0.0, 0.1, 0.4):
-        batches = batches_of(background_share=share)
-        drawn, natural = near_share(batches, steps=30)
-        margin = 4 * (share * (1 - share) / (30 * 64)) ** 0.5
-        assert drawn == pytest.approx(1 - share, abs=margin), share
-        assert batches.skipped == pytest.approx(1 - natural - share), share
-
-
-def test_without_skipping_pixels_are_drawn_evenly():
-    for options in ({"skip_background": False}, {"background_share": 1.0}):
-        batches = batches_of(per_batch=20_000, **options)
-        assert batches.skipped == 0, options
-        views = batches.views
-        height, width = views.height, views.width
-        counts = torch.zeros(len(views) * height * width)
-        for step in range(10):
-            batch = batches.draw(step)
-            origins = FRAME.to_world(batch["origins"])
-            view = torch.cdist(origins, views.camera_to_world[:, :3, 3]).argmin(dim=1)
-            local = (batch["directions"][:, None] @ views.camera_to_world[view, :3, :3])[:, 0]
-            column = (local[:, 0] / -local[:, 2] * FOCAL + width / 2).floor().long()
-            row = (-local[:, 1] / -local[:, 2] * FOCAL + height / 2).floor().long()
-            pixel = (view * height + row) * width + column
-            counts += torch.bincount(pixel, minlength=len(counts))
-        expected = counts.sum() / len(counts)
-        chi_squared = float(((counts - expected).square() / expected).sum())
-        freedom = len(counts) - 1
-        assert abs(chi_squared - freedom) < 5 * (2 * freedom) ** 0.5, options
-        assert counts.min() > 0, options
+@pytest.mark.parametrize(("option", "value"), [("skip_background", False), ("background_share", 1)])
+def test_without_skipping_pixels_are_drawn_evenly(option, value):
+    batches = batches_of(per_batch=20_000, **{option: value})
+    assert batches.skipped == 0
+    counts = torch.zeros(VIEWS.images.shape[:3])
+    for step in range(5):
+        places = pixels_of(batches.draw(step), VIEWS)
+        counts.index_put_(places, torch.ones(20_000), accumulate=True)
+    assert_even(counts)
+    assert counts.min() > 0
 
 
 def floor_views(side=120):
@@ -176,9 +140,8 @@ def floor_views(side=120):
     images = torch.full_like(views.images, 255)
     images[:, :30] = 0
     for index in range(6):
-        images[index, 60:80, 10 + 10 * index : 40 + 10 * index, :3] = torch.tensor(
-            [200, 30, 60], dtype=torch.uint8
-        )
+        square = images[index, 60:80, 10 + 10 * index : 40 + 10 * index]
+        square[..., :3] = torch.tensor([200, 30, 60], dtype=torch.uint8)
     return replace(views, images=images)
 
 
@@ -216,13 +179,13 @@ def test_plain_pixels_have_the_share_of_the_background_and_their_own_times():
     assert expected > 3 * float(red.float().mean())
     found = float((batch["target"][:, 1] < 0.5).float().mean())
     assert found == pytest.approx(expected, abs=0.015)
-    assert float((batch["alpha"] == 0).float().mean()) == pytest.approx(
-        0.1 + 0.7 * float((near & (views.images[..., 3] == 0)).sum() / near.sum()), abs=0.015
-    )
+    clear = views.images[..., 3] == 0
+    drawn_clear = float((batch["alpha"] == 0).float().mean())
+    expected = 0.1 + 0.7 * float((near & clear).sum() / near.sum())
+    assert drawn_clear == pytest.approx(expected, abs=0.015)
     assert set(batch["times"][batch["alpha"] == 1].tolist()) <= set(views.times.tolist())
-    assert batches.skipped == pytest.approx(
-        float((views.images[..., 3] == 0).float().mean()) + natural - 0.3, abs=0.05
-    )
+    skipped = float(clear.float().mean()) + natural - 0.3
+    assert batches.skipped == pytest.approx(skipped, abs=0.05)
     alike = batches_of(views, per_batch=20_000, skip_background=False)
     assert alike.skipped == 0
 
@@ -263,3 +226,95 @@ def test_batches_of_open_size_follow_the_device():
     assert (one_given.per_batch, one_given.samples_per_batch) == (2048, 524288)
     with pytest.raises(ConfigError, match="per_batch=many"):
         replace(RAYS, per_batch="many")
+
+
+# On a device
+
+
+CPU = torch.device("cpu")
+
+
+def splitmix(key, place):
+    """A number of the generator of Steele, Lea and Flood, in Python's whole numbers."""
+    bits = (key + place * 0x9E3779B97F4A7C15) % 2**64
+    bits = ((bits ^ bits >> 30) * 0xBF58476D1CE4E5B9) % 2**64
+    bits = ((bits ^ bits >> 27) * 0x94D049BB133111EB) % 2**64
+    return bits ^ bits >> 31
+
+
+def test_numbers_are_those_of_splitmix():
+    for seed, step, stream in itertools.product((0, 3), (0, 10**9), (0, 1_000_003)):
+        key = step_generator(seed, step, stream).initial_seed()
+        expected = [(splitmix(key, place) >> 11) / 2**53 for place in range(6)]
+        found = counted_uniform(seed, step, stream, (2, 3), CPU)
+        assert found.flatten().tolist() == expected, (seed, step, stream)
+
+
+def test_numbers_are_even_and_independent():
+    found = counted_uniform(1, 2, 3, (20000, 4), CPU)
+    assert 0 <= found.min() < 1e-4
+    assert 1 - 1e-4 < found.max() < 1
+    counts = torch.stack([torch.histc(column, 20, 0, 1) for column in found.T])
+    # A chi-squared of 19 degrees of freedom is above 44 once in a thousand.
+    assert ((counts - 1000).square() / 1000).sum(dim=1).max() < 50
+    assert (found.T.corrcoef() - torch.eye(4)).abs().max() < 0.03
+    following = counted_uniform(1, 3, 3, (20000, 4), CPU)
+    assert torch.stack([found.flatten(), following.flatten()]).corrcoef()[0, 1].abs() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("slopes", "options"),
+    [
+        *((slopes, {"background": kind}) for slopes in (False, True) for kind in ("white", "one")),
+        (True, {"background": "random"}),
+        (False, {"background": "random", "error_share": 0.5}),
+    ],
+    ids=str,
+)
+def test_batches_have_the_same_bits_on_every_device(fake_gpu, slopes, options):
+    batches = batches_of(background_jitter=0.1, seed=2, rank=1, **options)
+    if slopes:
+        batches.add_slopes()
+    errors = torch.full((MOST_TILES,), 0.1)
+    errors[[0, 3]] = torch.tensor([1.0, 0.5])
+    here, there = DeviceBatches(batches, CPU), DeviceBatches(batches, fake_gpu)
+    errors_there = errors.to(fake_gpu)
+    for step in (0, 7, 10**9):
+        with fake_device.counted() as counts:
+            drawn = there.draw(step, 48, errors_there)
+        assert counts.totals[1:] == (0, 0)
+        assert {value.device for value in drawn.values()} == {fake_gpu}
+        expected = here.draw(step, 48, errors)
+        assert same({name: value.cpu() for name, value in drawn.items()}, expected)
+        assert len(drawn["times"]) == 48
+        # Errors from a checkpoint may lie on the host.
+        assert same(drawn, there.draw(step, 48, errors))
+    assert here.draw(3).keys() == batches.draw(3).keys()
+    assert not torch.equal(here.draw(3)["jitter"], here.draw(4)["jitter"])
+
+
+def test_batches_are_distributed_like_those_of_the_cpu():
+    plain = batches_of(per_batch=4000, background="random", background_jitter=0.1)
+    drawn, expected = DeviceBatches(plain, CPU).draw(1), plain.draw(1)
+    assert drawn["target"].dtype == expected["target"].dtype
+    for name in ("origins", "directions", "times", "target", "background", "alpha", "jitter"):
+        ours, theirs = drawn[name].double(), expected[name].double()
+        spread = 2**0.5 * theirs.std(dim=0) / 4000**0.5
+        assert ((ours.mean(dim=0) - theirs.mean(dim=0)).abs() < 5 * spread + 1e-9).all(), name
+        torch.testing.assert_close(ours.std(dim=0), theirs.std(dim=0), rtol=0.1, atol=1e-9)
+    times = plain.views.times
+    moved = (drawn["times"][:, None] - times).abs().amin(dim=1) > 1e-6
+    assert moved.any()
+    assert not drawn["alpha"][moved].any()
+
+
+def test_who_can_be_served(fake_gpu, monkeypatch):
+    batches = batches_of()
+    assert DeviceBatches.can_serve(batches, fake_gpu)
+    assert not DeviceBatches.can_serve(batches, CPU)
+    monkeypatch.setattr("xplanes.scenes.batches.memory_left", lambda _: 3.9 * batches.views.nbytes)
+    assert not DeviceBatches.can_serve(batches, fake_gpu)
+    batches.views = replace(batches.views)
+    monkeypatch.setattr(type(batches.views), "is_stored", True)
+    monkeypatch.setattr("xplanes.scenes.batches.memory_left", lambda _: float("inf"))
+    assert not DeviceBatches.can_serve(batches, fake_gpu)

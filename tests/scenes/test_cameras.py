@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.oracles import project
-from xplanes.scenes.cameras import PosedCamera, cast_rays, focal_length, look_at, orbit
+from xplanes.scenes.cameras import cast_rays, focal_length, look_at, orbit
 from xplanes.scenes.frame import Frame
 
 EYE = torch.eye(4)
@@ -31,16 +31,7 @@ def test_pixel_centres_by_hand():
     assert (origins == 0).all()
 
 
-def test_image_rays_run_row_by_row():
-    origins, directions = PosedCamera(EYE, 2.0, 3, 4).rays()
-    assert origins.shape == directions.shape == (12, 3)
-    grid = directions.view(3, 4, 3)
-    assert (grid[:, 1:, 0] > grid[:, :-1, 0]).all()  # right along a row
-    assert (grid[1:, :, 1] < grid[:-1, :, 1]).all()  # down along a column
-    torch.testing.assert_close(directions.norm(dim=-1), torch.ones(12))
-
-
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     place=st.tuples(*[st.floats(-4, 4, width=32)] * 3).filter(lambda p: np.linalg.norm(p) > 0.1),
     row=st.integers(0, 8),
@@ -55,35 +46,22 @@ def test_points_on_a_ray_project_into_its_pixel(place, row, column, distance):
     assert project(point, pose.numpy(), 11.0, 9, 13) == (row, column, True)
 
 
-def test_each_ray_may_have_its_own_camera():
-    poses = look_at(torch.randn(6, 3, generator=torch.Generator().manual_seed(0)))
-    rows, columns = torch.arange(6.0), torch.arange(6.0).flip(0)
-    together = cast_rays(poses, rows, columns, focal=5.0, centre=(3.0, 3.0))
-    for index in range(6):
-        one = slice(index, index + 1)
-        alone = cast_rays(poses[index], rows[one], columns[one], focal=5.0, centre=(3.0, 3.0))
-        for a, b in zip(together, alone, strict=True):
-            torch.testing.assert_close(a[one], b)
-
-
 PLACES = torch.tensor([[3.0, 0, 0], [0, -2, 1], [1, 1, -5], [0, 0, 4], [0, 0, -4]])
 
 
-def test_look_at_makes_rigid_right_handed_poses_that_see_their_target():
-    for target in (None, torch.tensor([0.5, 0.25, -1.0])):
-        poses = look_at(PLACES, target)
-        aim = torch.zeros(3) if target is None else target
-        for pose, place in zip(poses, PLACES, strict=True):
-            case = f"from {place.tolist()} to {aim.tolist()}"
-            rotation = pose[:3, :3]
-            torch.testing.assert_close(rotation.T @ rotation, torch.eye(3), atol=1e-6, rtol=0)
-            assert float(rotation.det()) == pytest.approx(1, abs=1e-5), case
-            assert torch.equal(pose[:3, 3], place), case
-            assert pose[3].tolist() == [0, 0, 0, 1], case
-            towards = (aim - place) / (aim - place).norm()
-            torch.testing.assert_close(-rotation[:, 2], towards)
-            assert rotation[2, 0] == pytest.approx(0, abs=1e-6), case  # no roll
-            assert rotation[2, 1] >= -1e-6, case  # up is up
+@pytest.mark.parametrize("target", [None, (0.5, 0.25, -1.0)], ids=str)
+def test_look_at_makes_rigid_right_handed_poses_that_see_their_target(target):
+    aim = torch.tensor(target or (0.0, 0.0, 0.0))
+    poses = look_at(PLACES, aim if target else None)
+    for pose, place in zip(poses, PLACES, strict=True):
+        rotation = pose[:3, :3]
+        torch.testing.assert_close(rotation.T @ rotation, torch.eye(3), atol=1e-6, rtol=0)
+        assert float(rotation.det()) == pytest.approx(1, abs=1e-5), place
+        assert torch.equal(pose[:3, 3], place), place
+        assert pose[3].tolist() == [0, 0, 0, 1], place
+        torch.testing.assert_close(-rotation[:, 2], (aim - place) / (aim - place).norm())
+        assert rotation[2, 0] == pytest.approx(0, abs=1e-6), f"no roll from {place}"
+        assert rotation[2, 1] >= -1e-6, f"up is up from {place}"
 
 
 def test_straight_up_and_down_take_y_as_up():

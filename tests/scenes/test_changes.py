@@ -38,8 +38,8 @@ def test_what_differs_from_the_cameras_median_changes():
     for camera in range(CAMERAS):
         taken = images[:, camera, ..., :3]
         expected = abs(taken - np.median(taken, axis=0)).max(axis=-1) >= CHANGE
-        assert torch.equal(found.view(FRAMES, CAMERAS, SIZE, SIZE)[:, camera],
-                           torch.from_numpy(expected))  # fmt: skip
+        seen = found.view(FRAMES, CAMERAS, SIZE, SIZE)[:, camera]
+        assert torch.equal(seen, torch.from_numpy(expected))
     assert (found & ball).sum() > 0.8 * ball.sum()
     wide = changing(views, [2] * len(views))
     assert wide is not None
@@ -70,9 +70,11 @@ def test_rays_see_more_of_what_changes_and_all_of_the_rest():
     uniform = RayBatches(views, frame, replace(settings, skip_background=False), seed=0)
     assert uniform.far_share == 0
     green = torch.tensor([90, 140, 60]) / 255
-    ball = [float((b["target"] - green).abs().sum(dim=1).gt(0.1).float().mean())
-            for b in (batch, uniform.draw(0))]  # fmt: skip
-    assert ball[0] > 1.5 * ball[1]
+
+    def share_of_ball(drawn):
+        return float((drawn["target"] - green).abs().sum(dim=1).gt(0.1).float().mean())
+
+    assert share_of_ball(batch) > 1.5 * share_of_ball(uniform.draw(0))
     transparent = ball_views(6, 0.5, poses=views.camera_to_world[:1].expand(6, 4, 4), size=SIZE)
     assert RayBatches(transparent, frame, settings, seed=0).background_jitter > 0
 

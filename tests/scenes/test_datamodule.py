@@ -9,6 +9,7 @@ from torch.utils.data import DistributedSampler
 
 from tests.balls import RAYS as WHITE
 from tests.balls import ball_scene
+from tests.scenes.common import same
 from xplanes.errors import ConfigError
 from xplanes.scenes.batches import RayBatches
 from xplanes.scenes.datamodule import UNIFORM, SceneDataModule, spread_order
@@ -34,15 +35,13 @@ def take(module, count):
     return [next(stream) for _ in range(count)]
 
 
-def same(first, second):
-    return all(torch.equal(first[name], second[name]) for name in first)
-
-
-def test_batches_are_those_of_the_steps_in_order():
-    for rank in (0, 1):
-        module, batches = module_of(rank=rank)
+@pytest.mark.parametrize("rank", [0, 1])
+def test_batches_are_those_of_the_steps_in_order(rank):
+    module, batches = module_of(rank=rank)
+    for again in (False, True):  # Another module begins with the first batch.
         for step, batch in enumerate(take(module, 4)):
-            assert same(batch, batches(rank).draw(step)), (rank, step)
+            assert same(batch, batches(rank).draw(step)), (again, step)
+        module.setup("fit")
 
 
 def test_a_resumed_run_draws_what_an_uninterrupted_one_would():
@@ -66,13 +65,6 @@ def test_passes_over_the_loader_follow_one_another():
     assert same(second, batches(0).draw(1))
     views = module.scene.splits["train"]
     assert len(loader) == len(views) * views.height * views.width // RAYS.per_batch
-
-
-def test_another_module_begins_with_the_first_batch():
-    module, batches = module_of()
-    take(module, 3)
-    module.setup("fit")
-    assert same(take(module, 1)[0], batches(0).draw(0))
 
 
 def test_no_rays_of_held_out_views_are_trained_on():
@@ -101,39 +93,29 @@ def test_held_out_views_of_one_camera_are_spread_evenly():
     assert held_out_places([0.0], 8) == []
 
 
-def test_the_video_does_not_show_what_is_held_out():
+def test_neither_the_video_nor_other_views_show_what_is_held_out():
     scene = ball_scene(count=16)
     train = scene.splits["train"]
-    data = SceneDataModule.of(replace(scene, video=train))
+    data = SceneDataModule.of(replace(scene, video=train, lrm_views=train))
     data.setup("fit")
-    video = data.scene.video
-    assert video is not None
-    assert set(video.files) == set(data.scene.splits["train"].files)
-
-
-def test_nothing_shows_what_is_held_out_if_all_of_it_is():
-    scene = ball_scene(count=16)
-    train = scene.splits["train"]
-    data = SceneDataModule.of(scene)
+    splits = data.scene.splits
+    assert list(data.scene.video.files) == list(splits["train"].files)
+    assert list(data.scene.lrm_views.files) == list(splits["train"].files)
+    held_out = [index for index, file in enumerate(train.files) if file in splits["val"].files]
+    data = SceneDataModule.of(replace(scene, video=train.subset(torch.tensor(held_out))))
     data.setup("fit")
-    held_out = set(data.scene.splits["val"].files)
-    places = torch.tensor([i for i, file in enumerate(train.files) if file in held_out])
-    data = SceneDataModule.of(replace(scene, video=train.subset(places), lrm_views=train))
-    data.setup("fit")
-    assert data.scene.video is None
-    assert data.scene.lrm_views is not None
-    assert list(data.scene.lrm_views.files) == list(data.scene.splits["train"].files)
+    assert data.scene.video is None, "all of it is held out"
 
 
 def test_as_many_views_are_held_out_as_are_scored_at_most():
-    data = SceneDataModule.of(ball_scene(count=40))
-    data.setup("fit")
-    assert (len(data.scene.splits["train"]), len(data.scene.splits["val"])) == (35, 5)
-    few = SceneDataModule.of(ball_scene(count=40))
-    few.settings = replace(few.settings, eval_views=2)
-    few.setup("fit")
-    assert (len(few.scene.splits["train"]), len(few.scene.splits["val"])) == (38, 2)
-    assert set(few.scene.splits["val"].files) < set(data.scene.splits["val"].files)
+    held_out = {}
+    for most, counts in ((None, (35, 5)), (2, (38, 2))):
+        data = SceneDataModule.of(ball_scene(count=40))
+        data.settings = replace(data.settings, eval_views=most or data.settings.eval_views)
+        data.setup("fit")
+        assert tuple(len(data.scene.splits[name]) for name in ("train", "val")) == counts
+        held_out[most] = set(data.scene.splits["val"].files)
+    assert held_out[2] < held_out[None]
 
 
 def test_a_module_that_says_nothing_gets_rays_over_all_pixels_in_the_scenes_cube():

@@ -8,7 +8,7 @@ import torch
 from PIL import Image, features
 
 from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings, write_colmap
-from tests.refusals import assert_refused
+from tests.scenes.common import refused
 from xplanes import RadianceModule
 from xplanes.errors import ConfigError, LRMError, SceneError
 from xplanes.lrm.checkpoint import read_weights
@@ -71,7 +71,7 @@ def test_further_formats_are_read(tmp_path, ending, options):
 )  # fmt: skip
 def test_other_files_are_named_for_what_they_are(tmp_path, name, content, words):
     (tmp_path / name).write_bytes(content)
-    assert_refused(SceneError, words, partial(native_sizes, [tmp_path / name]), name)
+    refused(partial(native_sizes, [tmp_path / name]), words)
 
 
 def test_all_files_that_cannot_be_read_are_named_at_once(tmp_path):
@@ -79,33 +79,30 @@ def test_all_files_that_cannot_be_read_are_named_at_once(tmp_path):
     for path in paths[1:]:
         path.write_text(POINTER)
     save(paths[0], picture(0))
-    said = assert_refused(SceneError, "1.jpg is a pointer", partial(native_sizes, paths), paths)
-    assert "5.jpg is a pointer" in said
-    assert said.endswith("... and 1 more problems like these.")
+    last = r"\.\.\. and 1 more problems like these\.$"
+    refused(partial(native_sizes, paths), "1.jpg is a pointer", "5.jpg is a pointer", last)
 
 
 def test_pointers_of_git_lfs_are_named_wherever_a_file_is_read(tmp_path):
     words = "is a pointer of Git LFS.*git lfs pull"
-    readers = {
-        "model.safetensors": (LRMError, read_weights),
-        "model.ckpt": (LRMError, read_weights),
-        "last.ckpt": (ConfigError, load_checkpoint),
-        "best.ckpt": (ConfigError, RadianceModule.load_from_checkpoint),
-        "planes.safetensors": (ConfigError, load_triplanes),
-        "transforms.json": (SceneError, partial(read_object, content="frames")),
-    }
-    for name, (kind, read) in readers.items():
+    for name, error, read in (
+        ("model.safetensors", LRMError, read_weights),
+        ("model.ckpt", LRMError, read_weights),
+        ("last.ckpt", ConfigError, load_checkpoint),
+        ("best.ckpt", ConfigError, RadianceModule.load_from_checkpoint),
+        ("planes.safetensors", ConfigError, load_triplanes),
+        ("transforms.json", SceneError, partial(read_object, content="frames")),
+    ):
         (tmp_path / name).write_text(POINTER)
-        assert_refused(kind, words, partial(read, tmp_path / name), name)
-    for end in ("bin", "txt"):
-        for name in ("cameras", "images", "points3D"):
-            model = tmp_path / end / name
-            camera = {1: ("PINHOLE", WIDTH, HEIGHT, (36.0, 36.0, 20.0, 15.0))}
-            write_colmap(
-                model, camera, [("a.png", poses(1)[0], 1, 1)], [[0, 0, 0]], text=end == "txt"
-            )
-            (model / f"{name}.{end}").write_text(POINTER)
-            assert_refused(SceneError, words, partial(read_model, model), (name, end))
+        refused(partial(read, tmp_path / name), words, case=name, error=error)
+    camera = {1: ("PINHOLE", WIDTH, HEIGHT, (36.0, 36.0, 20.0, 15.0))}
+    images = [("a.png", poses(1)[0], 1, 1)]
+    parts = ("cameras", "images", "points3D")
+    for name in [f"{part}.{ending}" for part in parts for ending in ("bin", "txt")]:
+        model = tmp_path / name
+        write_colmap(model, camera, images, [[0, 0, 0]], text=name.endswith("txt"))
+        (model / name).write_text(POINTER)
+        refused(partial(read_model, model), words, case=name)
 
 
 STORED = {
@@ -114,6 +111,17 @@ STORED = {
     **{6: Image.Transpose.ROTATE_90, 7: Image.Transpose.TRANSVERSE, 8: Image.Transpose.ROTATE_270},
 }
 """How an upright picture is stored under each orientation of EXIF."""
+
+
+def photos(folder, pixels, tag, ending="jpg"):
+    """Four images whose EXIF tells how they are turned. Their names."""
+    exif = Image.Exif()
+    exif[0x0112] = tag
+    folder.mkdir(parents=True)
+    names = [f"{index}.{ending}" for index in range(4)]
+    for name in names:
+        pixels.save(folder / name, exif=exif, quality=95)
+    return names
 
 
 @pytest.mark.parametrize(
@@ -126,13 +134,8 @@ def test_what_is_up_follows_exif(tmp_path, tag, ending):
     stored = Image.fromarray(upright)
     if (turn := STORED[tag]) is not None:
         stored = stored.transpose(turn)
-    exif = Image.Exif()
-    exif[0x0112] = tag
-    names = [f"{i}.{ending}" for i in range(4)]
-    (tmp_path / "room/images").mkdir(parents=True)
-    for name in names:
-        stored.save(tmp_path / "room/images" / name, exif=exif, quality=95)
-        assert orientation(tmp_path / "room/images" / name) == tag
+    names = photos(tmp_path / "room/images", stored, tag, ending)
+    assert orientation(tmp_path / "room/images" / names[3]) == tag
     bright = np.argwhere(np.asarray(stored)[..., 0] > 128).mean(axis=0)
     row, column = bright - [(stored.height - 1) / 2, (stored.width - 1) / 2]
     width, height = stored.size
@@ -143,9 +146,8 @@ def test_what_is_up_follows_exif(tmp_path, tag, ending):
     for pose, (right, up) in zip(turns, level, strict=True):
         back = np.cross(right, up)
         aim = np.array([column, -row]) / np.hypot(row, column)
-        pose[:3, :3] = np.stack(
-            [right * aim[1] + up * aim[0], up * aim[1] - right * aim[0], back], axis=1
-        )
+        rolled = [right * aim[1] + up * aim[0], up * aim[1] - right * aim[0], back]
+        pose[:3, :3] = np.stack(rolled, axis=1)
     lying = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     turns[:, :3] = lying @ turns[:, :3]
     images = [(name, pose, 1, 0) for name, pose in zip(names, turns, strict=True)]
@@ -159,25 +161,17 @@ def test_what_is_up_follows_exif(tmp_path, tag, ending):
 
 
 def test_masks_and_cameras_of_turned_photos_say_exif(tmp_path):
-    folder, exif = tmp_path / "room", Image.Exif()
-    exif[0x0112] = 6
-    (folder / "images").mkdir(parents=True)
-    names = [f"{i}.jpg" for i in range(4)]
-    for index, name in enumerate(names):
-        Image.fromarray(picture(index)).save(folder / "images" / name, exif=exif)
-        save(folder / "masks" / f"{name}.png", picture(index, WIDTH, HEIGHT))
+    folder = tmp_path / "room"
+    names = photos(folder / "images", Image.fromarray(picture(0)), 6)
+    for name in names:
+        save(folder / "masks" / f"{name}.png", picture(1, WIDTH, HEIGHT))
     lens = (36.0, WIDTH / 2, HEIGHT / 2)
     images = [(name, pose, 1, 0) for name, pose in zip(names, poses(4), strict=True)]
-    write_colmap(folder / "sparse/0", {1: ("SIMPLE_PINHOLE", WIDTH, HEIGHT, lens)}, images)
-    read = partial(settings, ColmapSettings, "colmap", folder, static=True)
-    said = assert_refused(
-        SceneError,
-        r"EXIF orientation rotates it for display.*magick mogrify -rotate 270",
-        partial(read(masks="masks").load, ["train"]),
-        "masks",
-    )
-    assert all(f"{name}.png has 30x40 pixels" in said for name in names)
-    write_colmap(folder / "sparse/0", {1: ("SIMPLE_PINHOLE", HEIGHT, WIDTH, lens)}, images)
-    words = r"EXIF orientation.*calibrated with the rotated image.*-auto-orient"
-    said = assert_refused(SceneError, words, partial(read().load, ["train"]), "cameras")
-    assert all(f"{name} has 40x30 pixels" in said for name in names)
+    for width, height, masks, of_all, words in (
+        (WIDTH, HEIGHT, "masks", "{}.png has 30x40", r"for display.*magick mogrify -rotate 270"),
+        (HEIGHT, WIDTH, None, "{} has 40x30", r"calibrated with the rotated image.*-auto-orient"),
+    ):
+        write_colmap(folder / "sparse/0", {1: ("SIMPLE_PINHOLE", width, height, lens)}, images)
+        made = settings(ColmapSettings, "colmap", folder, static=True, masks=masks)
+        words = [f"EXIF orientation.*{words}", *map(of_all.format, names)]
+        refused(partial(made.load, ["train"]), *words)

@@ -12,8 +12,7 @@ import torch
 
 from tests.balls import ball_views, surrounding, swinging
 from tests.captures import save, settings, write_colmap
-from tests.refusals import assert_refused
-from xplanes.errors import SceneError
+from tests.scenes.common import assert_same_rays, refused
 from xplanes.scenes.colmap import ColmapSettings
 from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.scenes.multicamera import MultiCameraSettings
@@ -33,16 +32,8 @@ TRAIN, TEST = NAMES[FRAMES:], NAMES[:FRAMES]
 def captured() -> Views:
     """A ball that swings, and shades from red to green, seen by fixed cameras, one by one."""
     poses = surrounding(CAMERAS, 4.0, 2).repeat_interleave(FRAMES, dim=0)
-    moving = swinging(0.4, 0.4)
-    views = ball_views(
-        len(NAMES),
-        0.6,
-        centre=moving,
-        size=SIZE,
-        angle=ANGLE,
-        times=torch.tensor(TIMES),
-        poses=poses,
-    )
+    ball = {"centre": swinging(0.4, 0.4), "times": torch.tensor(TIMES), "poses": poses}
+    views = ball_views(len(NAMES), 0.6, size=SIZE, angle=ANGLE, **ball)
     images = views.in_memory().clone()
     shade = torch.arange(0, 240, 10, dtype=torch.uint8)
     images[..., 1] = torch.where(images[..., 3] > 0, shade[:, None], images[..., 1])
@@ -73,16 +64,12 @@ def write_images(folder: Path, masks: str = "{}.png") -> None:
 def blender(folder: Path) -> SceneSettings:
     for index, name in enumerate(NAMES):
         save(folder / f"{name}.png", rgba(index))
+    frames = {
+        name: {"file_path": f"./{name}", "transform_matrix": pose.tolist(), "time": time}
+        for name, pose, time in zip(NAMES, POSES, TIMES, strict=True)
+    }
     for split, part in (("train", TRAIN), ("test", TEST)):
-        frames = [
-            {
-                "file_path": f"./{name}",
-                "transform_matrix": POSES[NAMES.index(name)].tolist(),
-                "time": TIMES[NAMES.index(name)],
-            }
-            for name in part
-        ]
-        content = {"camera_angle_x": ANGLE, "frames": frames}
+        content = {"camera_angle_x": ANGLE, "frames": [frames[name] for name in part]}
         (folder / f"transforms_{split}.json").write_text(json.dumps(content))
     return settings(BlenderSettings, "blender", folder)
 
@@ -138,10 +125,7 @@ def nerfies(folder: Path) -> SceneSettings:
     lists = {"train_ids": [ids[name] for name in TRAIN], "val_ids": [ids[name] for name in TEST]}
     write("dataset.json", {"ids": list(ids.values()), **lists})
     write("scene.json", {"scale": scale, "center": centre.tolist()})
-    entries = {
-        ids[name]: {"warp_id": int(name[-4:]), "camera_id": int(name[3:5])} for name in NAMES
-    }
-    write("metadata.json", entries)
+    write("metadata.json", {ids[name]: {"warp_id": int(name[-4:])} for name in NAMES})
     return settings(NerfiesSettings, "nerfies", folder, masks="masks", orient=False)
 
 
@@ -184,8 +168,7 @@ def test_rays_pixels_masks_and_times_are_those_that_were_written(scenes, name):
         for index, written in enumerate(part):
             place = NAMES.index(written)
             assert torch.equal(views.image(index), VIEWS.image(place)), written
-            for mine, theirs in zip(views.image_rays(index), VIEWS.image_rays(place), strict=True):
-                assert (mine - theirs).abs().max() < 1e-5, written
+            assert_same_rays(views, index, VIEWS, place)
         assert views.times.tolist() == pytest.approx(TIMES[: len(part)], abs=1e-7)
 
 
@@ -209,6 +192,4 @@ def test_masks_for_lrms_leave_the_images_whole(name, tmp_path):
 
 def test_masks_that_are_not_there_are_not_for_lrms(tmp_path):
     made = replace(colmap(tmp_path, text=False), mask_use="lrm", masks=None)
-    assert_refused(
-        SceneError, r"data\.mask_use=lrm: no image has a mask file.*auto", made.read, made
-    )
+    refused(made.read, r"data\.mask_use=lrm: no image has a mask file.*auto")

@@ -21,14 +21,10 @@ def turned(scale=0.4):
 
 
 def views_of(poses, *, focal=50.0, size=10):
-    count = len(poses)
-    return Views(
-        torch.full((count, size, size, 4), 255, dtype=torch.uint8),
-        poses,
-        torch.linspace(0, 1, count),
-        focal,
-        tuple(map(str, range(count))),
-    )
+    """Opaque views."""
+    images = torch.full((len(poses), size, size, 4), 255, dtype=torch.uint8)
+    times = torch.linspace(0, 1, len(poses))
+    return Views(images, poses, times, focal, tuple(map(str, range(len(poses)))))
 
 
 def test_a_ray_and_its_points_move_together():
@@ -134,9 +130,8 @@ def test_rays_through_outlines_reach_as_far_as_all():
         kinds = torch.full((8,), int(model))
         lenses = Lenses(kinds, coefficients.clone(), torch.zeros(8, dtype=torch.float64))
         centres = torch.tensor([[27.0, 33.5]]).double().expand(8, 2)
-        intrinsics = Intrinsics(
-            torch.full((8, 2), 70.0).double(), centres, torch.tensor([[60, 60]] * 8), lenses
-        )
+        sizes = torch.tensor([[60, 60]] * 8)
+        intrinsics = Intrinsics(torch.full((8, 2), 70.0).double(), centres, sizes, lenses)
         for images in (ball.in_memory(), ring, whole):
             views = replace(ball, images=images, intrinsics=intrinsics)
             centre = optical_centre(views)
@@ -180,45 +175,48 @@ def ring(count=24, seed=0):
     return replace(views, images=images)
 
 
+def share_inside(frame, points):
+    return float((frame.points(points).abs().amax(dim=1) <= 1).float().mean())
+
+
 def test_opaque_scenes_take_the_cube_of_the_points_in_the_middle():
-    frame = scene_frame(ring(), CubeHints(points=points_of()))
+    views, points = ring(), points_of()
+    frame = scene_frame(views, CubeHints(points=points))
     assert frame.source == "points"
     # 96% of evenly spread points, with 15% of room.
     assert 1 / frame.scale == pytest.approx(1.15 * 0.96 * 0.5, rel=0.05)
     assert torch.allclose(frame.centre, CLUSTER, atol=0.04)
-    inside = frame.points(points_of()[:400]).abs().amax(dim=1) <= 1
-    assert inside.float().mean() > 0.95
+    assert share_inside(frame, points[:400]) > 0.95
     # Units and place of the world do not matter.
-    views, shift = ring(), torch.tensor([50.0, -20.0, 5.0])
+    shift = torch.tensor([50.0, -20.0, 5.0])
     poses = views.camera_to_world.clone()
     poses[:, :3, 3] = 10 * poses[:, :3, 3] + shift
     moved = scene_frame(
-        replace(views, camera_to_world=poses), CubeHints(points=10 * points_of() + shift)
+        replace(views, camera_to_world=poses), CubeHints(points=10 * points + shift)
     )
     assert moved.scale == pytest.approx(frame.scale / 10, rel=1e-3)
+    # A half-side that is given keeps its size around the points.
+    given = scene_frame(views, CubeHints(2.5, points=points))
+    assert (given.scale, given.source) == (0.4, "data.half_side")
+    assert torch.allclose(given.centre, CLUSTER, atol=0.04)
 
 
-def test_a_half_side_that_is_given_keeps_its_size_around_the_points():
-    frame = scene_frame(ring(), CubeHints(2.5, points=points_of()))
-    assert (frame.scale, frame.source) == (0.4, "data.half_side")
-    assert torch.allclose(frame.centre, CLUSTER, atol=0.04)
-
-
-def test_a_centre_that_is_given_holds_for_every_size():
-    views, centre = ring(), [0.1, -0.2, 0.05]
-    cases = {
-        "data.centre and data.half_side": CubeHints(2.5, centre),
-        "data.centre and points": CubeHints(centre=centre, points=points_of()),
-        "data.centre and cameras": CubeHints(centre=centre),
-    }
-    for source, hints in cases.items():
-        frame = scene_frame(views, hints)
-        assert frame.source == source
-        assert frame.centre.tolist() == pytest.approx(centre)
+@pytest.mark.parametrize(
+    ("source", "hints"),
+    [
+        ("data.centre and data.half_side", {"half_side": 2.5}),
+        ("data.centre and points", {"points": points_of()}),
+        ("data.centre and cameras", {}),
+    ],
+)
+def test_a_centre_that_is_given_holds_for_every_size(source, hints):
+    centre = [0.1, -0.2, 0.05]
+    frame = scene_frame(ring(), CubeHints(centre=centre, **hints))
+    assert frame.source == source
+    assert frame.centre.tolist() == pytest.approx(centre)
     # Around another centre the cube must reach farther to hold the same points.
-    around = scene_frame(views, cases["data.centre and points"])
-    inside = around.points(points_of()[:400]).abs().amax(dim=1) <= 1
-    assert inside.float().mean() > 0.95
+    if "points" in hints:
+        assert share_inside(frame, points_of()[:400]) > 0.95
 
 
 def test_silhouettes_come_before_points():

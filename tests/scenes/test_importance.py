@@ -7,11 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests import fake_device
 from tests.balls import ball_views
-from tests.scenes.test_batches import VIEWS, batches_of, same
+from tests.scenes.common import assert_own_rays, numbered, same
+from tests.scenes.test_batches import VIEWS, batches_of
 from xplanes.scenes import importance
-from xplanes.scenes.batches import DeviceBatches
 from xplanes.scenes.importance import (
     CANDIDATES,
     KEPT,
@@ -21,8 +20,6 @@ from xplanes.scenes.importance import (
     Tiles,
     preferred,
 )
-
-CPU = torch.device("cpu")
 
 
 def map_of(values: dict[int, float]) -> torch.Tensor:
@@ -37,7 +34,7 @@ def test_weighted_means_over_preferred_pixels_are_unbiased():
     generator = torch.Generator().manual_seed(0)
     errors = torch.rand(4000, generator=generator) ** 4
     values = errors + torch.rand(4000, generator=generator)
-    offsets = (torch.arange(500, dtype=torch.float64) + 0.5) / 500
+    offsets = (torch.arange(200, dtype=torch.float64) + 0.5) / 200
     for share in (0.3, 0.5, 0.8):
         found = []
         for offset in offsets:
@@ -105,35 +102,9 @@ def test_rays_are_drawn_where_errors_are_large_as_a_function_of_the_step():
 
 
 def test_preferred_pixels_have_their_own_colours_and_rays():
-    batches = batches_of(error_share=0.5)
-    assert batches.tiles is not None
-    drawn = batches.draw(2, 200, map_of({0: 1.0}))
-    origins, directions = (
-        torch.stack(rays).flatten(1, -2)
-        for rays in zip(*(VIEWS.camera(i).rays() for i in range(len(VIEWS))), strict=True)
-    )
-    origins, directions = batches.frame.rays(origins, directions)
-    colours = torch.stack([VIEWS.composite(i, torch.ones(3)) for i in range(len(VIEWS))])
-    for origin, direction, target in zip(
-        drawn["origins"], drawn["directions"], drawn["target"], strict=True
-    ):
-        away = (directions - direction).norm(dim=-1) + (origins - origin).norm(dim=-1)
-        assert torch.equal(colours.flatten(1, 2).flatten(0, 1)[away.argmin()], target)
-
-
-def test_preferred_rays_have_the_same_bits_on_every_device(fake_gpu):
-    batches = batches_of(error_share=0.5, background="random", background_jitter=0.1)
-    assert batches.tiles is not None
-    errors = map_of({0: 1.0, 3: 0.5})
-    here, there = DeviceBatches(batches, CPU), DeviceBatches(batches, fake_gpu)
-    errors_there = errors.to(fake_gpu)
-    with fake_device.counted() as counts:
-        drawn = there.draw(7, 64, errors_there)
-    assert counts.totals[1:] == (0, 0)
-    assert same({name: value.cpu() for name, value in drawn.items()}, here.draw(7, 64, errors))
-    assert len(drawn["times"]) == 64
-    # Errors from a checkpoint may lie on the host.
-    assert same(drawn, there.draw(7, 64, errors))
+    views = numbered(VIEWS)
+    batch = batches_of(views, error_share=0.5).draw(2, 200, map_of({0: 1.0}))
+    assert_own_rays(batch, views)
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """Images of different cameras and sizes: rays, padding, and files that tell of them."""
 
-import json
 import math
 from dataclasses import replace
 from functools import partial
@@ -8,28 +7,34 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from tests.balls import RAYS as WHITE
 from tests.balls import ball_views, inside_ball, surrounding
-from tests.captures import settings
-from tests.refusals import assert_refused
+from tests.lens_oracle import pixel
+from tests.scenes.common import (
+    ANGLE,
+    SceneFolder,
+    assert_even,
+    assert_same_rays,
+    drawn_pixels,
+    numbered,
+    refused,
+    rgba,
+    same,
+)
 from xplanes.baselines.tineuvox.model import frusta_box
-from xplanes.errors import SceneError
 from xplanes.preparation.fixed_view import check_camera
 from xplanes.rendering.carving import carve
 from xplanes.rendering.filling import fill
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.batches import RayBatches
 from xplanes.scenes.cameras import focal_length
-from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.scenes.frame import cube_frame, scene_frame
 from xplanes.scenes.silhouettes import foreground, may_hold
 from xplanes.scenes.source import frames_are_equal
 from xplanes.scenes.views import Intrinsics, Views, joined
 
 RADIUS = 0.5
-COLOUR = [200, 100, 50, 255]
 # Height, width, focal lengths along x and y, principal point from the left and from the top.
 WIDE = (30, 44, 41.0, 36.5, 25.25, 13.5)
 UPRIGHT = (38, 26, 55.0, 58.0, 12.0, 21.75)
@@ -57,33 +62,22 @@ def rays_of(pose, height, width, focal_x, focal_y, centre_x, centre_y):
     return np.tile(pose[:3, 3], (height * width, 1)), np.array(directions)
 
 
-def pixel_of(point, pose, focal_x, focal_y, centre_x, centre_y):
-    """Independent reference: row and column, with fractions, at which a world point is seen."""
-    pose = np.asarray(pose, dtype=np.float64)
-    right, up, back = (np.asarray(point, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3]
-    assert back < 0
-    return centre_y - focal_y * up / -back, centre_x + focal_x * right / -back
-
-
-def rendered(cameras, poses, times=None, centre=(0.0, 0.0, 0.0)):
+def rendered(cameras, poses, times=None):
     """A ball before cameras of which each has its own size and intrinsics."""
     images = []
     for camera, pose in zip(cameras, poses, strict=True):
         origins, directions = rays_of(pose, *camera)
-        offset = np.array(centre) - origins
-        along = (offset * directions).sum(axis=1)
-        hit = (offset**2).sum(axis=1) - along**2 < RADIUS**2
+        along = (origins * directions).sum(axis=1)
         image = np.zeros((camera[0] * camera[1], 4), np.uint8)
-        image[hit] = COLOUR
+        image[(origins**2).sum(axis=1) - along**2 < RADIUS**2] = [200, 100, 50, 255]
         images.append(torch.from_numpy(image.reshape(camera[0], camera[1], 4)))
-    count = len(images)
     known = torch.tensor(cameras, dtype=torch.float64)
     return Views(
         padded(images),
         poses,
-        torch.linspace(0, 1, count) if times is None else times,
+        torch.linspace(0, 1, len(poses)) if times is None else times,
         Intrinsics(known[:, 2:4], known[:, 4:], known[:, :2].long()),
-        tuple(f"{number:03d}.png" for number in range(count)),
+        tuple(f"{number:03d}.png" for number in range(len(poses))),
     )
 
 
@@ -101,14 +95,8 @@ def soiled(views, value):
     return replace(views, images=images)
 
 
-def opaque(views):
-    """The same with pixels of nothing but content; padding stays."""
-    images = views.images.clone()
-    images[views.valid()] = 255
-    return replace(views, images=images)
-
-
 RAYS = replace(WHITE, per_batch=500, background="random")
+FRAME = cube_frame(1.4, torch.zeros(3))
 
 
 # What views are
@@ -175,8 +163,7 @@ def test_views_of_different_cameras_are_joined():
         part, own = (views, index) if index < 4 else (square, index - 4)
         assert torch.equal(both.image(index), part.image(own)), index
         assert both.times[index] == part.times[own]
-        for mine, theirs in zip(both.image_rays(index), part.image_rays(own), strict=True):
-            assert torch.equal(mine, theirs), index
+        assert_same_rays(both, index, part, own, atol=0)
     assert not both.images[~both.valid()].any()
 
 
@@ -203,58 +190,29 @@ def test_rays_are_those_of_the_formula():
         assert np.abs(found[1].numpy() - directions).max() < 1e-6, index
 
 
-def test_batches_draw_all_pixels_and_no_padding():
-    views = mixed(4)
-    generator = torch.Generator().manual_seed(0)
-    images = torch.randint(0, 256, views.images.shape, generator=generator, dtype=torch.uint8)
-    images[..., 3] = views.images[..., 3]
-    images[..., :3] = torch.minimum(images[..., :3], images[..., 3:])
-    views = soiled(replace(views, images=images), 255)
-    frame = cube_frame(1.4, torch.zeros(3))
-    for skip in (True, False):
-        batches = RayBatches(views, frame, replace(RAYS, skip_background=skip), seed=0)
-        drawn = torch.zeros(views.images.shape[:3], dtype=torch.long)
-        for step in range(60):
-            batch = batches.draw(step)
-            view, row, column = batches_pixels(batch, views)
-            assert views.valid()[view, row, column].all(), (skip, step)
-            seen = views.images[view, row, column].float() / 255
-            expected = seen[:, :3] + (1 - seen[:, 3:]) * batch["background"]
-            assert torch.allclose(batch["target"], expected, atol=1e-6), (skip, step)
-            drawn.view(-1).index_add_(
-                0, (view * 38 + row) * 44 + column, torch.ones(len(view), dtype=torch.long)
-            )
-        if not skip:
-            assert (drawn[views.valid()] > 0).float().mean() > 0.99
-            expected = 60 * 500 / views.pixels
-            chi_squared = float(((drawn[views.valid()] - expected) ** 2 / expected).sum())
-            assert abs(chi_squared - views.pixels) < 5 * (2 * views.pixels) ** 0.5
-
-
-def batches_pixels(batch, views):
-    """View, row and column of each ray: the pixels whose rays are the nearest."""
-    found = torch.empty(3, len(batch["times"]), dtype=torch.long)
-    for view, time in enumerate(views.times):
-        mine = batch["times"] == time
-        near = (batch["directions"][mine] @ views.image_rays(view)[1].T).argmax(dim=1)
-        width = views.size(view)[1]
-        found[:, mine] = torch.stack([torch.full_like(near, view), near // width, near % width])
-    return found
+@pytest.mark.parametrize("skip", [True, False])
+def test_batches_draw_all_pixels_and_no_padding(skip):
+    views = numbered(mixed(4))
+    batches = RayBatches(views, FRAME, replace(RAYS, skip_background=skip), seed=0)
+    counts = drawn_pixels(batches, 60)
+    assert not counts[~views.valid()].any()
+    assert_even(counts[views.valid()])
 
 
 def test_background_and_near_rays_are_shares_of_what_is_no_padding():
     views = mixed(6)
-    frame = cube_frame(1.4, torch.zeros(3))
-    batches = RayBatches(views, frame, RAYS, seed=0)
+    batches = RayBatches(views, FRAME, RAYS, seed=0)
     assert batches.near_pixels + batches.far_pixels == views.pixels
-    alone = [RayBatches(views.subset(torch.tensor([i])), frame, RAYS, seed=0) for i in range(6)]
+    alone = [RayBatches(views.subset(torch.tensor([i])), FRAME, RAYS, seed=0) for i in range(6)]
     for pixels in ("near_pixels", "far_pixels"):
         count = sum(getattr(one, pixels) for one in alone)
         assert getattr(batches, pixels) == count, pixels
     natural = batches.far_pixels / views.pixels
     assert batches.skipped == pytest.approx(natural - 0.1)
     # Images of nothing but padding and content have no background.
-    assert RayBatches(opaque(views), frame, RAYS, seed=0).far_pixels == 0
+    images = views.images.clone()
+    images[views.valid()] = 255
+    assert RayBatches(replace(views, images=images), FRAME, RAYS, seed=0).far_pixels == 0
 
 
 # What is seen in them
@@ -262,7 +220,7 @@ def test_background_and_near_rays_are_shares_of_what_is_no_padding():
 
 def test_padding_is_nothing_whatever_it_holds():
     views = mixed(8, times=torch.zeros(8))
-    dirty, frame = soiled(views, 255), cube_frame(1.4, torch.zeros(3))
+    dirty = soiled(views, 255)
     assert not torch.equal(views.images, dirty.images)
     points = inside_ball(2000, 2.0)
     assert torch.equal(may_hold(dirty, points, radius=0.05), may_hold(views, points, radius=0.05))
@@ -270,33 +228,28 @@ def test_padding_is_nothing_whatever_it_holds():
     assert not foreground(dirty, 3)[~views.valid()].any()
     assert scene_frame(dirty).scale == scene_frame(views).scale
     assert torch.equal(frusta_box(dirty, 2, 6, 1.0), frusta_box(views, 2, 6, 1.0))
-    grids = [OccupancyGrid(12, 1, step=0.05) for _ in range(2)]
+    grids = [OccupancyGrid(8, 1, step=0.05) for _ in range(2)]
     for grid, those in zip(grids, (views, dirty), strict=True):
-        carve(grid, those, frame)
-        fill(
-            grid,
-            lambda points, _: (points, torch.zeros(len(points))),
-            those,
-            frame,
-            step=0.05,
-            generator=torch.Generator().manual_seed(0),
-        )
+        carve(grid, those, FRAME)
+        options = {"step": 0.05, "generator": torch.Generator().manual_seed(0)}
+        fill(grid, lambda points, _: (points, 0 * points[:, 0]), those, FRAME, **options)
     assert 0 < grids[0].occupied.float().mean() < 1
     assert torch.equal(grids[0].occupied, grids[1].occupied)
-    one, other = (RayBatches(those, frame, RAYS, seed=0).draw(3) for those in (views, dirty))
-    assert all(torch.equal(one[name], other[name]) for name in one)
+    assert same(*(RayBatches(those, FRAME, RAYS, seed=0).draw(3) for those in (views, dirty)))
 
 
 def test_cameras_together_see_what_each_sees():
     views = mixed(6)
-    points = inside_ball(1500, 2.5)
+    points = inside_ball(500, 2.5)
     alone = [may_hold(views.subset(torch.tensor([i])), points, radius=0.03) for i in range(6)]
     assert torch.equal(may_hold(views, points, radius=0.03), torch.cat(alone))
-    for index, camera in enumerate([WIDE, UPRIGHT] * 3):
-        height, width = camera[:2]
+    for index, (height, width, *lens) in enumerate([WIDE, UPRIGHT] * 3):
+        pose = views.camera_to_world[index].double()
+        local = ((points - pose[:3, 3]) @ pose[:3, :3]).tolist()
+        assert all(point[2] < 0 for point in local)
         held = may_hold(views, points, radius=0.0)[index]
-        for point, there in zip(points, held, strict=True):
-            row, column = pixel_of(point, views.camera_to_world[index], *camera[2:])
+        for point, there in zip(local, held, strict=True):
+            column, row = pixel("perspective", point, {}, lens[:2], lens[2:])
             if min(abs(row - round(row)), abs(column - round(column))) < 1e-3:
                 continue
             seen = 0 <= row < height and 0 <= column < width
@@ -325,121 +278,86 @@ def test_a_video_that_models_cannot_take_is_refused():
         ("a", "b", "c"),
     )
     check_camera(video)
+
+    def changed(name, column, change):
+        value = getattr(square, name).clone()
+        value[:, column] += change
+        return replace(video, intrinsics=replace(square, **{name: value}))
+
     for name, column, change, words in (
         ("focal", 0, 0.4, r"30\.4 and 30 pixels along x and y.*square pixels"),
         ("focal", 1, -0.4, r"30 and 29\.6 pixels"),
         ("centre", 0, 0.9, r"principal point is at 20\.9, 10 of 40x20 pixels"),
         ("centre", 1, -0.9, r"principal point is at 20, 9\.1"),
     ):
-        for part in (1.0, 0.5):
-            value = getattr(square, name).clone()
-            value[:, column] += part * change
-            other = replace(video, intrinsics=replace(square, **{name: value}))
-            if part < 1:
-                check_camera(other)
-                continue
-            words = rf"(?s){words}.*preparation\.fixed_view=train"
-            assert_refused(SceneError, words, partial(check_camera, other), name)
+        check_camera(changed(name, column, 0.5 * change))
+        check = partial(check_camera, changed(name, column, change))
+        refused(check, rf"(?s){words}.*preparation\.fixed_view=train")
     focal = square.focal.clone()
     focal[1] += 1
     zoomed = replace(video, intrinsics=replace(square, focal=focal))
-    assert_refused(SceneError, "differ in focal length", partial(check_camera, zoomed), "zoom")
+    refused(partial(check_camera, zoomed), "differ in focal length")
 
 
 # Files
 
 
-ANGLE = 0.7
-
-
-def write(folder, sizes, *, split="train", shared=None, frames=None):
-    """A scene on disk: images of some widths and heights, keys of the file and of each frame."""
-    (folder / split).mkdir(parents=True, exist_ok=True)
-    content = {"camera_angle_x": ANGLE} if shared is None else dict(shared)
-    content["frames"] = []
-    poses = surrounding(len(sizes), 4.0).double().tolist()
-    for index, (width, height) in enumerate(sizes):
-        pixels = np.random.default_rng(index).integers(0, 256, (height, width, 4), dtype=np.uint8)
-        Image.fromarray(pixels).save(folder / split / f"{index}.png")
-        content["frames"].append(
-            {
-                "file_path": f"./{split}/{index}",
-                "time": index / (len(sizes) - 1),
-                "transform_matrix": poses[index],
-                **(frames[index] if frames else {}),
-            }
-        )
-    (folder / f"transforms_{split}.json").write_text(json.dumps(content))
-    return folder
-
-
-def read(folder, resolution=None):
-    made = settings(BlenderSettings, "blender", folder, resolution=resolution)
-    return made.load(["train"]).splits["train"]
-
-
 def test_a_scene_that_tells_every_frames_camera_equals_one_that_tells_an_angle(tmp_path):
-    sizes, focal = [(12, 12)] * 4, focal_length(ANGLE, 12)
+    focal = focal_length(ANGLE, 12)
     keys = {"fl_x": focal, "fl_y": focal, "cx": 6.0, "cy": 6.0, "w": 12, "h": 12}
-    plain = write(tmp_path / "plain", sizes)
     folders = {
-        "frames": write(tmp_path / "frames", sizes, shared={}, frames=[keys] * 4),
-        "file": write(tmp_path / "file", sizes, shared=keys),
-        "both": write(tmp_path / "both", sizes, frames=[keys] * 4),
-        "fl_x": write(tmp_path / "fl_x", sizes, shared={"fl_x": focal}),
-        "other size": write(
-            tmp_path / "other", sizes, shared={key: 10 * value for key, value in keys.items()}
-        ),
-        "one side": write(tmp_path / "one", sizes, shared={"fl_x": 5 * focal, "h": 60, "cx": 30}),
+        "frames": {"shared": {}, "frames": [keys] * 4},
+        "file": {"shared": keys},
+        "both": {"frames": [keys] * 4},
+        "focal length": {"shared": {"fl_x": focal}},
+        "other size": {"shared": {key: 10 * value for key, value in keys.items()}},
+        "one side": {"shared": {"fl_x": 5 * focal, "h": 60, "cx": 30}},
     }
-    for resolution in (None, 6, 5):
-        expected = read(plain, resolution)
-        for name, folder in folders.items():
-            found = read(folder, resolution)
+    plain = SceneFolder(tmp_path / "plain").add("train", 4)
+    told = {
+        name: SceneFolder(tmp_path / name).add("train", 4, **how) for name, how in folders.items()
+    }
+    for resolution in (None, 5):
+        expected = plain.train(resolution=resolution)
+        for name, folder in told.items():
+            found = folder.train(resolution=resolution)
             assert torch.equal(found.images, expected.images), name
             for part in ("focal", "centre", "size"):
                 mine, theirs = (getattr(v.intrinsics, part) for v in (found, expected))
                 assert torch.allclose(mine.double(), theirs.double(), rtol=1e-12, atol=0), name
             for index in range(4):
-                for mine, theirs in zip(
-                    found.image_rays(index), expected.image_rays(index), strict=True
-                ):
-                    assert torch.allclose(mine, theirs, rtol=0, atol=1e-6), (name, resolution)
+                assert_same_rays(found, index, expected, index, atol=1e-6)
 
 
 def test_a_frames_own_keys_go_before_the_files(tmp_path):
-    frames = [
-        {},
-        {"fl_x": 20.0},
-        {"fl_x": 20.0, "fl_y": 22.0, "cx": 5.0, "cy": 7.5},
-        {"camera_angle_x": 0.5},
-        {"w": 24, "h": 36},
-    ]
     shared = {"camera_angle_x": ANGLE, "fl_x": 30.0, "fl_y": 33.0, "cx": 6.5, "w": 12, "h": 18}
-    views = read(write(tmp_path, [(12, 18)] * 5, shared=shared, frames=frames))
     narrow = focal_length(0.5, 12)
-    expected = [[30, 33], [20, 33], [20, 22], [narrow, narrow], [15, 16.5]]
-    torch.testing.assert_close(
-        views.intrinsics.focal, torch.tensor(expected, dtype=torch.float64), rtol=1e-6, atol=0
-    )
-    expected = [[6.5, 9], [6.5, 9], [5, 7.5], [6.5, 9], [3.25, 9]]
-    assert views.intrinsics.centre.tolist() == expected
+    cases = [
+        ({}, [30, 33], [6.5, 9]),
+        ({"fl_x": 20.0}, [20, 33], [6.5, 9]),
+        ({"fl_x": 20.0, "fl_y": 22.0, "cx": 5.0, "cy": 7.5}, [20, 22], [5, 7.5]),
+        ({"camera_angle_x": 0.5}, [narrow, narrow], [6.5, 9]),
+        ({"w": 24, "h": 36}, [15, 16.5], [3.25, 9]),
+    ]
+    frames, focal, centre = zip(*cases, strict=True)
+    scene = SceneFolder(tmp_path).add("train", [(12, 18)] * 5, shared=shared, frames=frames)
+    found = scene.train().intrinsics
+    torch.testing.assert_close(found.focal, torch.tensor(focal).double(), rtol=1e-6, atol=0)
+    assert found.centre.tolist() == list(centre)
 
 
 def test_images_of_different_sizes_are_read(tmp_path):
     sizes = [(12, 12), (8, 8), (12, 12), (20, 20)]
-    folder = write(tmp_path / "square", sizes)
-    views = read(folder)
+    scene = SceneFolder(tmp_path).add("train", sizes)
+    views = scene.train()
     assert views.images.shape == (4, 20, 20, 4)
     assert [views.size(i) for i in range(4)] == sizes
     assert not views.images[~views.valid()].any()
     for index, (width, _) in enumerate(sizes):
         focal = focal_length(ANGLE, width)
         assert views.intrinsics.focal[index].tolist() == pytest.approx([focal] * 2)
-        with Image.open(folder / views.files[index]) as picture:
-            alpha = np.asarray(picture)[..., 3]
-        assert np.array_equal(views.image(index)[..., 3].numpy(), alpha), index
-    shrunk = read(folder, resolution=4)
+        assert np.array_equal(views.image(index)[..., 3], rgba(index, width)[..., 3]), index
+    shrunk = scene.train(resolution=4)
     assert shrunk.images.shape == (4, 4, 4, 4)
     assert shrunk.intrinsics.is_shared
     assert shrunk.intrinsics.focal[3, 1] == pytest.approx(focal_length(ANGLE, 4))
@@ -451,8 +369,9 @@ def test_intrinsics_shrink_with_images_of_different_sizes(tmp_path):
         {"fl_x": 30.0, "cx": 8.0, "w": 16, "h": 16},  # of a file half that size
         {"fl_x": 25.0, "fl_y": 20.0, "cy": 11.0},
     ]
-    views = read(write(tmp_path, [(12, 12), (8, 8), (20, 20)], shared={}, frames=frames), 4)
-    expected = [[5, 14 / 3], [7.5, 7.5], [5, 4]]
-    torch.testing.assert_close(views.intrinsics.focal, torch.tensor(expected, dtype=torch.float64))
-    expected = [[5 / 3, 7 / 3], [2, 2], [2, 2.2]]
-    torch.testing.assert_close(views.intrinsics.centre, torch.tensor(expected, dtype=torch.float64))
+    sizes = [(12, 12), (8, 8), (20, 20)]
+    scene = SceneFolder(tmp_path).add("train", sizes, shared={}, frames=frames)
+    found = scene.train(resolution=4).intrinsics
+    focal, centre = [[5, 14 / 3], [7.5, 7.5], [5, 4]], [[5 / 3, 7 / 3], [2, 2], [2, 2.2]]
+    torch.testing.assert_close(found.focal, torch.tensor(focal).double())
+    torch.testing.assert_close(found.centre, torch.tensor(centre).double())

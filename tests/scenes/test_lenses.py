@@ -21,15 +21,13 @@ from xplanes.scenes.views import Intrinsics, Views
 
 HEIGHT, WIDTH = 30, 44
 FOCAL, CENTRE = (35.0, 37.0), (20.5, 16.25)
+EYE = torch.eye(4, dtype=torch.float64)
 
 LENSES = {
     "barrel": ("perspective", {"k1": -0.2, "k2": 0.03}),
     "pincushion": ("perspective", {"k1": 0.3, "k2": 0.1, "k3": 0.05}),
     "tangential": ("perspective", {"k1": -0.1, "p1": 0.02, "p2": -0.015}),
-    "rational": (
-        "perspective",
-        {"k1": 0.9, "k2": 0.3, "k3": 0.02, "k4": 1.0, "k5": 0.3, "k6": 0.02},
-    ),
+    "rational": ("perspective", {"k1": 0.9, "k2": 0.3, "k4": 1.0, "k5": 0.3, "k6": 0.02}),
     "polynomial": ("polynomial", {"k1": 0.1, "k2": -0.05, "k3": 0.04, "k4": 0.03, "p1": 0.01}),
     "prism": ("perspective", {"s1": 0.02, "s2": -0.01, "s3": -0.015, "s4": 0.01}),
     "equidistant": ("fisheye", {}),
@@ -67,14 +65,15 @@ def grid():
     return rows.flatten().double(), columns.flatten().double()
 
 
-def cast(name, rows, columns, pose=None, skew=0.0):
+def cast(*names, rows, columns, pose=EYE, skew=0.0):
+    count = len(names)
     return cast_rays(
-        torch.eye(4, dtype=torch.float64) if pose is None else pose,
+        pose,
         rows,
         columns,
-        focal=torch.tensor(FOCAL, dtype=torch.float64),
-        centre=torch.tensor(CENTRE, dtype=torch.float64),
-        lenses=lenses_of(name, skew=skew),
+        focal=torch.tensor([FOCAL] * count, dtype=torch.float64).squeeze(0),
+        centre=torch.tensor([CENTRE] * count, dtype=torch.float64).squeeze(0),
+        lenses=lenses_of(*names, skew=skew),
     )
 
 
@@ -88,7 +87,7 @@ def test_rays_are_those_of_a_search(name):
     rows = torch.from_numpy(generator.uniform(-0.5, HEIGHT - 0.5, 12))
     columns = torch.from_numpy(generator.uniform(-0.5, WIDTH - 0.5, 12))
     for skew in (0.0, 1.5):
-        _, found = cast(name, rows, columns, skew=skew)
+        _, found = cast(name, rows=rows, columns=columns, skew=skew)
         assert found.dtype == torch.float64
         for ray, row, column in zip(found.tolist(), rows.tolist(), columns.tolist(), strict=True):
             target = (column + 0.5, row + 0.5)
@@ -101,7 +100,7 @@ def test_points_on_rays_are_seen_at_their_pixels(name):
     model, k = LENSES[name]
     pose = look_at(torch.tensor([[1.0, -3.0, 2.0]], dtype=torch.float64))[0]
     rows, columns = grid()
-    origins, directions = cast(name, rows, columns, pose, skew=0.7)
+    origins, directions = cast(name, rows=rows, columns=columns, pose=pose, skew=0.7)
     options = {"focal": torch.tensor(FOCAL), "centre": torch.tensor(CENTRE)}
     points = origins + torch.linspace(0.5, 9, len(rows))[:, None] * directions
     x, y, seen = project(pose, points, lenses=lenses_of(name, skew=0.7), **options)
@@ -115,15 +114,13 @@ def test_points_on_rays_are_seen_at_their_pixels(name):
 
 def test_lenses_of_one_batch_do_not_mix():
     names = [name for name in LENSES for _ in range(3)]
-    lenses = lenses_of(*names)
-    rows = torch.rand(len(names), dtype=torch.float64) * HEIGHT
-    columns = torch.rand(len(names), dtype=torch.float64) * WIDTH
-    pose = torch.eye(4, dtype=torch.float64)
-    focal = torch.tensor([FOCAL] * len(names), dtype=torch.float64)
-    centre = torch.tensor([CENTRE] * len(names), dtype=torch.float64)
-    _, found = cast_rays(pose, rows, columns, focal=focal, centre=centre, lenses=lenses)
+    generator = torch.Generator().manual_seed(0)
+    places = torch.rand(2, len(names), generator=generator, dtype=torch.float64)
+    rows, columns = places[0] * HEIGHT, places[1] * WIDTH
+    _, found = cast(*names, rows=rows, columns=columns)
     for index, name in enumerate(names):
-        alone = cast(name, rows[index : index + 1], columns[index : index + 1])[1][0]
+        one = slice(index, index + 1)
+        alone = cast(name, rows=rows[one], columns=columns[one])[1][0]
         torch.testing.assert_close(found[index], alone, atol=1e-12, rtol=0)
 
 
@@ -210,21 +207,23 @@ def test_balls_reach_no_farther_than_said(name):
     intrinsics = intrinsics_of(name, skew=1.0, focal=(20.0, 22.0))
     focal, centre, lens = intrinsics.focal[0], intrinsics.centre[0], intrinsics.lens(0)
     sight = intrinsics.sights[0]
-    pose = torch.eye(4, dtype=torch.float64)
     generator = torch.Generator().manual_seed(1)
     middle = 2 * torch.randn(400, 3, generator=generator, dtype=torch.float64)
     middle[:40, :2] *= 0.05  # near the axis, before and behind the camera
+
+    def seen_at(points):
+        x, y, seen = project(EYE, points, focal=focal, centre=centre, lenses=lens)
+        return x, y, seen & (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
+
+    x, y, inside = seen_at(middle)
     for radius in (0.02, 0.4):
-        extent = ball_extent(pose, middle, radius, focal=focal, lenses=lens, stretch=sight.stretch)
-        x, y, seen = project(pose, middle, focal=focal, centre=centre, lenses=lens)
-        seen &= (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT) & extent.isfinite()
+        extent = ball_extent(EYE, middle, radius, focal=focal, lenses=lens, stretch=sight.stretch)
+        seen = inside & extent.isfinite()
         assert seen.sum() > 20
         largest = torch.zeros(400, dtype=torch.float64)
-        for _ in range(200):
+        for _ in range(60):
             edge = torch.randn(400, 3, generator=generator, dtype=torch.float64)
-            edge = middle + radius * edge / edge.norm(dim=1, keepdim=True)
-            there_x, there_y, shown = project(pose, edge, focal=focal, centre=centre, lenses=lens)
-            shown &= (there_x >= 0) & (there_x < WIDTH) & (there_y >= 0) & (there_y < HEIGHT)
+            there_x, there_y, shown = seen_at(middle + radius * edge / edge.norm(dim=1)[:, None])
             moved = torch.maximum((there_x - x).abs(), (there_y - y).abs())
             largest = torch.where(shown, torch.maximum(largest, moved), largest)
         assert (largest[seen] <= extent[seen]).all()
@@ -256,30 +255,24 @@ def test_fisheye_lenses_see_beside_and_behind_themselves():
 
 
 def test_pinholes_that_stand_for_lenses_see_as_wide():
-    for name, angle in (("barrel", None), ("equidistant", 44 / 35)):
-        intrinsics = intrinsics_of(name, focal=(35.0, 35.0), centre=(22.0, 15.0))
-        if angle is None:
-            ends = torch.tensor([-0.5, WIDTH - 0.5]), torch.full((2,), HEIGHT / 2 - 0.5)
-            _, (left, right) = cast_rays(
-                torch.eye(4),
-                ends[1],
-                ends[0],
-                focal=intrinsics.focal[0],
-                centre=intrinsics.centre[0],
-                lenses=intrinsics.lenses,
-            )
-            angle = math.acos(float(left @ right))
+    barrel, fisheye = (
+        intrinsics_of(name, focal=(35.0, 35.0), centre=(22.0, 15.0))
+        for name in ("barrel", "equidistant")
+    )
+    lens = {"focal": barrel.focal[0], "centre": barrel.centre[0], "lenses": barrel.lenses}
+    ends = torch.tensor([-0.5, WIDTH - 0.5])
+    _, (left, right) = cast_rays(EYE, torch.full((2,), HEIGHT / 2 - 0.5), ends, **lens)
+    for intrinsics, angle in ((barrel, math.acos(float(left @ right))), (fisheye, 44 / 35)):
         focal = float(intrinsics.pinhole[0, 0])
-        assert 2 * math.atan(22 / focal) == pytest.approx(angle, abs=1e-5), name
+        assert 2 * math.atan(22 / focal) == pytest.approx(angle, abs=1e-5)
     wide = intrinsics_of("equidistant", focal=(9.0, 9.0))
     assert wide.fov_y == pytest.approx(WIDEST)
 
 
 def test_a_distorted_video_is_refused_where_pinholes_are_needed():
+    poses = surrounding(1, 4.0).repeat(2, 1, 1)
     centre = (WIDTH / 2, HEIGHT / 2)
-    views = seen_ball(
-        ["barrel"] * 2, surrounding(1, 4.0).repeat(2, 1, 1), 0.5, centre=centre, focal=(35.0, 35.0)
-    )
+    views = seen_ball(["barrel"] * 2, poses, 0.5, centre=centre, focal=(35.0, 35.0))
     with pytest.raises(SceneError, match=r"distorts.*preparation\.fixed_view=train"):
         check_camera(views)
     weak = replace(views.intrinsics.lenses, coefficients=views.intrinsics.lenses.coefficients / 50)

@@ -7,25 +7,28 @@ import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from tests.balls import ball_views, surrounding, swinging
-from tests.captures import settings, write_colmap
+from tests.captures import save, settings, write_colmap
+from tests.scenes.common import assert_same_rays, refused, told
 from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.optional import MissingExtraError
 from xplanes.scenes import store
 from xplanes.scenes import videos as recordings
+from xplanes.scenes.colmap import ColmapSettings
+from xplanes.scenes.llff import LlffSettings
 from xplanes.scenes.multicamera import MultiCameraSettings, read_cameras
+from xplanes.scenes.nerfstudio import NerfstudioSettings
 from xplanes.scenes.source import SceneSettings
-from xplanes.scenes.views import Views
-from xplanes.tools.inspect import choose
+from xplanes.scenes.views import Scene, Views
 
 av = pytest.importorskip("av")
 imageio = pytest.importorskip("imageio.v2")
@@ -33,21 +36,22 @@ imageio = pytest.importorskip("imageio.v2")
 CAMERAS, FRAMES, SIZE = 4, 6, 48
 
 
-def captured(cameras: int = CAMERAS, frames: int = FRAMES) -> Views:
+def captured() -> Views:
     """A swinging ball before grey, seen by fixed cameras: opaque, camera by camera."""
-    poses = surrounding(cameras, 4.0, 0).repeat_interleave(frames, dim=0)
-    times = torch.linspace(0, 1, frames).repeat(cameras)
+    poses = surrounding(CAMERAS, 4.0, 0).repeat_interleave(FRAMES, dim=0)
+    times = torch.linspace(0, 1, FRAMES).repeat(CAMERAS)
     views = ball_views(
         len(poses), 0.6, centre=swinging(0.5, 0.3), size=SIZE, times=times, poses=poses
     )
-    white = torch.tensor([0.4, 0.4, 0.4])
-    pixels = torch.stack([views.composite(i, white) for i in range(len(views))])
-    opaque = torch.full((*pixels.shape[:3], 4), 255, dtype=torch.uint8)
-    opaque[..., :3] = (pixels * 255).round().byte()
-    return replace(views, images=opaque)
+    images = views.in_memory().clone()
+    images[images[..., 3] == 0] = 102
+    images[..., 3] = 255
+    return replace(views, images=images)
 
 
 VIEWS = captured()
+POSES = VIEWS.camera_to_world[::FRAMES].double().numpy()
+FOCAL = float(VIEWS.intrinsics.focal[0, 0])
 
 
 def rgb(camera: int) -> np.ndarray:
@@ -63,9 +67,8 @@ def write_video(path: Path, frames: np.ndarray, rate: float = 30) -> None:
 
 
 def write_images(folder: Path, frames: np.ndarray) -> None:
-    folder.mkdir(parents=True)
     for number, frame in enumerate(frames):
-        Image.fromarray(frame).save(folder / f"{number + 5}.png")  # 10 comes after 9.
+        save(folder / f"{number + 5}.png", frame)  # 10 comes after 9.
 
 
 def neural_3d_video(folder: Path, write: Callable, suffix: str) -> Path:
@@ -74,45 +77,49 @@ def neural_3d_video(folder: Path, write: Callable, suffix: str) -> Path:
     rows = []
     for camera in range(CAMERAS):
         write(folder / f"cam{camera:02d}{suffix}", rgb(camera))
-        pose = VIEWS.camera_to_world[camera * FRAMES].double().numpy()
-        right, up, back, centre = pose[:3].T
-        focal = 2 * float(VIEWS.intrinsics.focal[0, 0])
-        hwf = np.array([2 * SIZE, 2 * SIZE, focal])
+        right, up, back, centre = POSES[camera][:3].T
+        hwf = np.array([2 * SIZE, 2 * SIZE, 2 * FOCAL])
         matrix = np.stack([-up, right, back, centre, hwf], axis=1)
         rows.append([*matrix.ravel(), 1.0, 9.0])
     np.save(folder / "poses_bounds.npy", np.array(rows))
     return folder
 
 
-def with_transforms(folder: Path, name: Callable[[int], str]) -> None:
+def with_transforms(folder: Path, name: str | Callable[[int], str]) -> None:
+    """A transforms.json in which the place of each camera is a format of its number, or a call."""
+    name = name.format if isinstance(name, str) else name
     frames = [
-        {
-            "file_path": name(camera),
-            "transform_matrix": VIEWS.camera_to_world[camera * FRAMES].tolist(),
-        }
-        for camera in range(CAMERAS)
+        {"file_path": name(camera), "transform_matrix": pose.tolist()}
+        for camera, pose in enumerate(POSES)
     ]
-    focal = float(VIEWS.intrinsics.focal[0, 0])
-    content = {"fl_x": focal, "w": SIZE, "h": SIZE, "frames": frames}
+    content = {"fl_x": FOCAL, "w": SIZE, "h": SIZE, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(content))
 
 
-def with_colmap(folder: Path, name: Callable[[int], str], **changes) -> None:
+def with_colmap(folder: Path, name, *, height=2 * SIZE, cameras=CAMERAS, text=False) -> None:
     """A sparse model of one image of each camera, twice as large as the frames."""
-    focal, middle = 2 * float(VIEWS.intrinsics.focal[0, 0]), float(SIZE)
-    lens = {
-        1: ("PINHOLE", 2 * SIZE, changes.get("height", 2 * SIZE), (focal, focal, middle, middle))
-    }
-    images = [
-        (name(camera), VIEWS.camera_to_world[camera * FRAMES].double().numpy(), 1, 3)
-        for camera in range(changes.get("cameras", CAMERAS))
-    ]
-    write_colmap(folder / "sparse" / "0", lens, images, text=changes.get("text", False))
+    name = name.format if isinstance(name, str) else name
+    lens = {1: ("PINHOLE", 2 * SIZE, height, (2 * FOCAL, 2 * FOCAL, float(SIZE), float(SIZE)))}
+    images = [(name(camera), POSES[camera], 1, 3) for camera in range(cameras)]
+    write_colmap(folder / "sparse" / "0", lens, images, text=text)
 
 
 @pytest.fixture(scope="module")
 def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Videos, not to be changed."""
     return neural_3d_video(tmp_path_factory.mktemp("n3v") / "scene", write_video, ".mp4")
+
+
+@pytest.fixture
+def copied(videos: Path, tmp_path: Path) -> Path:
+    """The same videos, which may be changed."""
+    return shutil.copytree(videos, tmp_path / "copied")
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> Path:
+    """The same frames as images."""
+    return neural_3d_video(tmp_path / "scene", write_images, "")
 
 
 def read(folder: Path, splits=("train", "test"), **options):
@@ -120,13 +127,29 @@ def read(folder: Path, splits=("train", "test"), **options):
     return settings(MultiCameraSettings, "multicamera", folder, **options).load(splits)
 
 
+def refuse(folder: Path, words: str, error: type[Exception] = SceneError, **options) -> None:
+    refused(partial(read, folder, **options), words, case=(words, options), error=error)
+
+
 def require_rays_of(found: Views, indices: list[int]) -> None:
     expected = VIEWS.subset(torch.tensor(indices))
     assert len(found) == len(expected)
     assert torch.allclose(found.times, expected.times)
     for index in range(len(found)):
-        for one, other in zip(found.image_rays(index), expected.image_rays(index), strict=True):
-            assert (one - other).abs().max() < 1e-5
+        assert_same_rays(found, index, expected, index)
+
+
+def require_all(scene: Scene) -> None:
+    """All frames are there with every pixel, those of the first camera as test views."""
+    for split, first, last in (("test", 0, FRAMES), ("train", FRAMES, len(VIEWS))):
+        require_rays_of(scene.splits[split], list(range(first, last)))
+        assert torch.equal(scene.splits[split].in_memory(), VIEWS.in_memory()[first:last])
+
+
+def require_recognised(folder: Path) -> None:
+    """No other format takes the folder for its own."""
+    kinds = (ColmapSettings, LlffSettings, NerfstudioSettings, MultiCameraSettings)
+    assert [kind for kind in kinds if kind.recognises(folder)] == [MultiCameraSettings]
 
 
 def test_videos_of_neural_3d_video(videos):
@@ -145,22 +168,13 @@ def test_videos_of_neural_3d_video(videos):
         assert int(torch.stack(gaps).argmin()) == number
 
 
-def test_folders_of_images_keep_every_pixel(tmp_path):
-    folder = neural_3d_video(tmp_path / "scene", write_images, "")
-    scene = read(folder)
-    assert torch.equal(scene.splits["test"].in_memory(), VIEWS.in_memory()[:FRAMES])
-    assert torch.equal(scene.splits["train"].in_memory(), VIEWS.in_memory()[FRAMES:])
-    (folder / "poses_bounds.npy").unlink()
-    for name in (
-        lambda camera: f"cam{camera:02d}",
-        lambda camera: f"./cam{camera:02d}/5.png",
-        lambda camera: f"cam{camera:02d}\\5",
-    ):
-        with_transforms(folder, name)
-        assert choose([str(folder)]).scene.name == "multicamera"
-        again = read(folder)
-        require_rays_of(again.splits["train"], list(range(FRAMES, CAMERAS * FRAMES)))
-        assert torch.equal(again.splits["train"].in_memory(), scene.splits["train"].in_memory())
+def test_folders_of_images_keep_every_pixel(images):
+    require_all(read(images))
+    (images / "poses_bounds.npy").unlink()
+    for name in ("cam{:02d}", "./cam{:02d}/5.png", "cam{:02d}\\5"):
+        with_transforms(images, name)
+        require_recognised(images)
+        require_all(read(images))
 
 
 @pytest.mark.parametrize(
@@ -170,93 +184,73 @@ def test_folders_of_images_keep_every_pixel(tmp_path):
         ("frames", "", "CAM_{}"),
     ],
 )
-def test_folders_of_cameras_may_have_other_names_and_levels(tmp_path, outer, inner, name):
-    plain = neural_3d_video(tmp_path / "plain", write_images, "")
-    folder = tmp_path / "deeper"
-    folder.mkdir()
-    np.save(folder / "poses_bounds.npy", np.load(plain / "poses_bounds.npy"))
+def test_folders_of_cameras_may_have_other_names_and_levels(videos, tmp_path, outer, inner, name):
+    shutil.copy(videos / "poses_bounds.npy", tmp_path)
     for camera in range(CAMERAS):
-        place = folder / outer / name.format(camera)
+        place = tmp_path / outer / name.format(camera)
         write_images(place / inner, rgb(camera))
         if "images" in inner:
             write_images(place / "masks", rgb(camera))
-    assert choose([str(folder)]).scene.name == "multicamera"
-    scene = read(folder, test_cameras=[name.format(0)])
-    require_rays_of(scene.splits["test"], list(range(FRAMES)))
-    pixels = scene.splits["test"].in_memory()[..., :3]
-    assert np.array_equal(pixels.numpy(), rgb(0))
+    require_recognised(tmp_path)
+    require_all(read(tmp_path, test_cameras=[name.format(0)]))
 
 
-def test_transforms_may_name_videos(videos, tmp_path):
-    for video in videos.glob("*.mp4"):
-        (tmp_path / video.name).write_bytes(video.read_bytes())
-    with_transforms(tmp_path, lambda camera: f"cam{camera:02d}.mp4")
-    one, other = read(tmp_path), read(videos)
+def test_transforms_may_name_videos(videos, copied):
+    (copied / "poses_bounds.npy").unlink()
+    with_transforms(copied, "cam{:02d}.mp4")
+    one, other = read(copied), read(videos)
     assert torch.equal(one.splits["train"].in_memory(), other.splits["train"].in_memory())
 
 
-def test_colmap_may_have_registered_an_image_of_each_camera(tmp_path):
-    folder = neural_3d_video(tmp_path / "scene", write_images, "")
-    (folder / "poses_bounds.npy").unlink()
-    with_transforms(folder, lambda camera: f"cam{camera:02d}")
-    expected = read(folder)
-    (folder / "transforms.json").unlink()
-    for text, name in (
-        (False, lambda camera: f"cam{camera:02d}.jpg"),
-        (False, lambda camera: f"cam{camera:02d}/0005.png"),
-        (True, lambda camera: f"first frames/cam{camera:02d}.png"),
-    ):
-        with_colmap(folder, name, text=text)
-        found = read(folder)
-        assert choose([str(folder)]).overrides[0] == "data=multicamera"
-        for split, views in expected.splits.items():
-            assert found.splits[split].files == views.files
-            assert torch.equal(found.splits[split].in_memory(), views.in_memory())
-            assert torch.equal(found.splits[split].times, views.times)
-            for index in range(len(views)):
-                mine, theirs = found.splits[split].image_rays(index), views.image_rays(index)
-                for one, other in zip(mine, theirs, strict=True):
-                    assert (one - other).abs().max() < 1e-5
-        for path in (folder / "sparse" / "0").iterdir():
-            path.unlink()
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("cam{:02d}.jpg", False),
+        ("cam{:02d}/0005.png", False),
+        ("first frames/cam{:02d}.png", True),
+    ],
+)
+def test_colmap_may_have_registered_an_image_of_each_camera(images, name, text):
+    expected = read(images)
+    (images / "poses_bounds.npy").unlink()
+    with_colmap(images, name, text=text)
+    require_recognised(images)
+    found = read(images)
+    require_all(found)
+    assert found.splits["train"].files == expected.splits["train"].files
     assert found.video.files == expected.video.files
 
 
-def test_images_and_cameras_that_do_not_belong_together(videos, tmp_path):
-    folder = tmp_path / "scene"
-    folder.mkdir()
-    for path in videos.glob("*.mp4"):
-        (folder / path.name).write_bytes(path.read_bytes())
+def test_images_and_cameras_that_do_not_belong_together(copied):
+    (copied / "poses_bounds.npy").unlink()
 
-    def refused(match: str, name: Callable[[int], str], **changes) -> None:
-        with_colmap(folder, name, **changes)
-        with pytest.raises(SceneError, match=match):
-            read(folder)
+    def refuse_model(words: str, name: str | Callable[[int], str], **changes) -> None:
+        with_colmap(copied, name, **changes)
+        refuse(copied, words)
 
-    def plain(camera: int) -> str:
-        return f"cam{camera:02d}.png"
-
-    both = r"images\.bin: {}.*Registered images: {}.*cam\*, in .*scene: cam00\.mp4, cam01\.mp4"
-    (folder / "images").mkdir()
-    with_colmap(folder, plain)
-    assert len(read_cameras(folder)) == CAMERAS
+    plain = "cam{:02d}.png"
+    both = r"images\.bin: {}.*Registered images: {}.*cam\*, in .*copied: cam00\.mp4, cam01\.mp4"
+    (copied / "images").mkdir()
+    with_colmap(copied, plain)
+    assert len(read_cameras(copied)) == CAMERAS
     left = r"left0\.png, left1\.png, left2\.png, left3\.png"
-    refused(both.format("left0.png may be of no video or folder", left), "left{}.png".format)
-    refused(
+    refuse_model(both.format("left0.png may be of no video or folder", left), "left{}.png")
+    refuse_model(
         both.format("cam00/1.png, cam00/2.png, .* belongs to cam00.mp4", "cam00/1.png"),
         lambda camera: f"cam00/{camera + 1}.png",
     )
     three = r"cam00\.png, cam01\.png, cam02\.png\. "
-    refused(both.format("no registered image belongs to cam03.mp4", three), plain, cameras=3)
-    refused(r"cam00\.mp4 has 48x48 pixels, but .* 96x48, of another aspect", plain, height=SIZE)
-    (folder / "cam02.mov").write_bytes(b"")
-    refused(r"cam02\.png may be of cam02\.mov or of cam02\.mp4", plain)
-    (folder / "cam02.mov").unlink()
-    (folder / "0001").mkdir()
-    refused("cam00/0001.png may be of 0001 or of cam00", lambda camera: f"cam{camera:02d}/0001.png")
-    (folder / "sparse" / "0" / "images.bin").unlink()
-    with pytest.raises(SceneError, match=r"holds neither images\.bin nor images\.txt"):
-        read(folder)
+    refuse_model(both.format("no registered image belongs to cam03.mp4", three), plain, cameras=3)
+    refuse_model(
+        r"cam00\.mp4 has 48x48 pixels, but .* 96x48, of another aspect", plain, height=SIZE
+    )
+    (copied / "cam02.mov").write_bytes(b"")
+    refuse_model(r"cam02\.png may be of cam02\.mov or of cam02\.mp4", plain)
+    (copied / "cam02.mov").unlink()
+    (copied / "0001").mkdir()
+    refuse_model("cam00/0001.png may be of 0001 or of cam00", "cam{:02d}/0001.png")
+    (copied / "sparse" / "0" / "images.bin").unlink()
+    refuse(copied, r"holds neither images\.bin nor images\.txt")
 
 
 def test_frames_by_range_and_stride(videos):
@@ -284,8 +278,7 @@ def test_the_video_is_that_of_a_training_camera(videos):
     assert read(videos, splits=("train",), video_camera="cam03").video.files[0][:5] == "cam03"
     for name in ("cam00", "cam9"):
         words = f"video_camera={name} is not a training camera.*must not see.*cam01, cam02"
-        with pytest.raises(SceneError, match=words):
-            read(videos, video_camera=name)
+        refuse(videos, words, video_camera=name)
 
 
 def test_large_captures_are_kept_on_disk(videos, tmp_path, monkeypatch, capsys):
@@ -306,123 +299,106 @@ def test_large_captures_are_kept_on_disk(videos, tmp_path, monkeypatch, capsys):
 
 
 def test_settings_of_the_command_line(videos):
-    plain = compose_plain(
-        "train",
-        [
-            "data=multicamera",
-            f"data.root={videos.parent}",
-            f"data.scene={videos.name}",
-            "data.resolution=null",
-            "data.frames=[0,2,1]",
-        ],
-    )
+    place = [f"data.root={videos.parent}", f"data.scene={videos.name}", "data.resolution=null"]
+    plain = compose_plain("train", ["data=multicamera", *place, "data.frames=[0,2,1]"])
     settings = build(plain["data"], SceneSettings, "data")
     scene = settings.read()
     assert set(scene.splits) == {"train", "test"}
     assert len(scene.video) == 3
     assert not scene.static_reason
-    with pytest.raises(SceneError, match=r"train_on_video=true.*already"):
-        replace(settings, train_on_video=True).read()
-    for frames in ([0, 1], [3, 2, 1], [-1, 2, 1], [0, 2, 0]):
-        with pytest.raises(ConfigError, match="frames="):
-            replace(settings, frames=frames)
-    with pytest.raises(ConfigError, match=r"centre=\[1.0, 2.0\]: must be three"):
-        replace(settings, centre=[1, 2])
+    for error, words, changes in (
+        (SceneError, r"train_on_video=true.*already", {"train_on_video": True}),
+        *((ConfigError, "frames=", {"frames": f}) for f in ([0, 1], [3, 2, 1], [-1, 2, 1])),
+        (ConfigError, "frames=", {"frames": [0, 2, 0]}),
+        (ConfigError, r"centre=\[1.0, 2.0\]: must be three", {"centre": [1, 2]}),
+    ):
+        refused(lambda c=changes: replace(settings, **c).read(), words, case=changes, error=error)
 
 
-def test_a_camera_is_held_out_by_default(videos, tmp_path, caplog):
+def test_a_camera_is_held_out_by_default(videos, caplog):
     with caplog.at_level("INFO"):
         scene = read(videos, test_cameras=None)
     assert {file.split("/")[0] for file in scene.splits["test"].files} == {"cam00"}
     assert "held out cam00 of the cameras cam00, cam01" in caplog.text
 
 
-def test_cameras_of_different_lengths_and_rates(videos, tmp_path, caplog):
-    folder = tmp_path / "scene"
-    folder.mkdir()
-    for path in videos.iterdir():
-        (folder / path.name).write_bytes(path.read_bytes())
-    write_video(folder / "cam02.mp4", rgb(2)[:4])
+def test_cameras_of_different_lengths_and_rates(copied, caplog):
+    write_video(copied / "cam02.mp4", rgb(2)[:4])
     with caplog.at_level(logging.WARNING):
-        scene = read(folder)
+        train = read(copied).splits["train"]
     assert "camera cam02 has 4 frames, but cam00 6: the first 4 frames" in caplog.text
-    assert len(scene.splits["train"]) == 3 * 4
-    assert scene.splits["train"].times[:4].tolist() == pytest.approx([0, 1 / 3, 2 / 3, 1])
-    with pytest.raises(SceneError, match=r"cam02\.mp4 has 4 frames.*data\.frames=\[0,3,1\]"):
-        read(folder, frames=[0, 5, 1])
-    write_video(folder / "cam02.mp4", rgb(2), rate=25)
-    scene = read(folder)
-    times = {camera: [] for camera in ("cam01", "cam02", "cam03")}
-    for file, time in zip(scene.splits["train"].files, scene.splits["train"].times, strict=True):
-        times[file.split("/")[0]].append(float(time))
-    last = (FRAMES - 1) / 25
-    assert times["cam02"] == pytest.approx([i / 25 / last for i in range(FRAMES)], abs=0.01)
-    assert times["cam01"] == pytest.approx([i / 30 / last for i in range(FRAMES)], abs=0.01)
+    assert len(train) == 3 * 4
+    assert train.times[:4].tolist() == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    words = r"cam02\.mp4 has 4 frames.*data\.frames=\[0,3,1\]"
+    refuse(copied, words, frames=[0, 5, 1])
+    write_video(copied / "cam02.mp4", rgb(2), rate=25)
+    train = read(copied).splits["train"]
+    assert [file[:5] for file in train.files[::FRAMES]] == ["cam01", "cam02", "cam03"]
+    for times, rate in zip(train.times.view(3, FRAMES).tolist(), (30, 25, 30), strict=True):
+        shares = [number * 25 / rate / (FRAMES - 1) for number in range(FRAMES)]
+        assert times == pytest.approx(shares, abs=0.01)
 
 
 @pytest.mark.parametrize("apart", [0, 100])
-@pytest.mark.parametrize("gone", [[FRAMES - 1], [2], [0], [1, FRAMES - 1]])
-def test_a_frame_that_one_camera_lacks_is_left_out(tmp_path, apart, gone):
-    folder = neural_3d_video(tmp_path / "scene", write_images, "")
-    whole = read(folder).splits["train"]
+@pytest.mark.parametrize("gone", [[FRAMES - 1], [2], [0], [1, FRAMES - 1]], ids=str)
+def test_a_frame_that_one_camera_lacks_is_left_out(images, apart, gone):
     for camera in range(CAMERAS):  # Cameras may have their own numbers for the same timestep.
-        for path in sorted((folder / f"cam{camera:02d}").iterdir(), key=lambda p: int(p.stem)):
+        for path in sorted((images / f"cam{camera:02d}").iterdir(), key=lambda p: int(p.stem)):
             path.rename(path.with_name(f"x{int(path.stem) + apart * camera}.png"))
     for number in gone:
-        (folder / "cam02" / f"x{5 + number + 2 * apart}.png").unlink()
-    words = f"not all cameras have an image .* {3 * len(gone)} images are left out"
-    with pytest.warns(UserWarning, match=words):
-        views = read(folder).splits["train"]
+        (images / "cam02" / f"x{5 + number + 2 * apart}.png").unlink()
+    with told(f"not all cameras have an image .* {3 * len(gone)} images are left out"):
+        views = read(images).splits["train"]
     if apart and 0 in gone:
         return  # Nobody can tell whether the first or the last one is missing.
     kept = [number for number in range(FRAMES) if number not in gone]
     times = [(number - kept[0]) / (kept[-1] - kept[0]) for number in kept]
     assert views.times.tolist() == pytest.approx(times * (CAMERAS - 1))
-    places = [camera * FRAMES + number for camera in range(CAMERAS - 1) for number in kept]
-    assert torch.equal(views.in_memory(), whole.in_memory()[places])
+    places = [camera * FRAMES + number for camera in range(1, CAMERAS) for number in kept]
+    assert torch.equal(views.in_memory(), VIEWS.in_memory()[places])
 
 
-def test_images_that_are_missing_beside_videos(tmp_path):
-    folder = neural_3d_video(tmp_path / "scene", write_images, "")
-    write_video(folder / "cam03.mp4", rgb(3))
-    shutil.rmtree(folder / "cam03")
-    (folder / "cam02" / "7.png").unlink()
-    with pytest.raises(SceneError, match=r"numbers of cam00/7\.png, cam01/7\.png\. Add what is"):
-        read(folder)
+def test_images_that_are_missing_beside_videos(images):
+    write_video(images / "cam03.mp4", rgb(3))
+    shutil.rmtree(images / "cam03")
+    (images / "cam02" / "7.png").unlink()
+    refuse(images, r"numbers of cam00/7\.png, cam01/7\.png\. Add what is")
 
 
-def test_folders_beside_cameras_are_none(tmp_path):
-    folder = neural_3d_video(tmp_path / "scene", write_images, "")
-    whole = read(folder).splits["train"]
+def test_folders_beside_cameras_are_none(images):
     for name in ("camera_paths", "mv_images/00000", "mv_images/00001"):
-        write_images(folder / name, rgb(0)[:1])
-    assert torch.equal(read(folder).splits["train"].in_memory(), whole.in_memory())
+        write_images(images / name, rgb(0)[:1])
+    require_all(read(images))
 
 
-def test_damaged_files_are_named(videos, tmp_path):
-    folder = tmp_path / "scene"
-    folder.mkdir()
-    for path in videos.iterdir():
-        (folder / path.name).write_bytes(path.read_bytes())
-    poses = np.load(folder / "poses_bounds.npy")
+@pytest.mark.parametrize(
+    ("words", "error", "options"),
+    [
+        (r"no split val: its splits are train, test", MissingSplitError, {"splits": ("val",)}),
+        (r"has no split test", MissingSplitError, {"test_cameras": []}),
+        (r"no camera cam7\. Its cameras are cam00, cam01", SceneError, {"test_cameras": ["cam7"]}),
+        (r"leaves no camera", SceneError, {"test_cameras": [f"cam0{i}" for i in range(4)]}),
+    ],
+)
+def test_splits_and_cameras_that_are_not_there(videos, words, error, options):
+    refuse(videos, words, error=error, **options)
 
-    def refused(match: str, error: type[Exception] = SceneError, **options) -> None:
-        with pytest.raises(error, match=match):
-            read(folder, **options)
 
-    refused(r"has no split val: its splits are train, test", MissingSplitError, splits=("val",))
-    refused(r"has no split test", MissingSplitError, test_cameras=[])
-    refused(r"no camera cam7\. Its cameras are cam00, cam01", test_cameras=["cam7"])
-    refused(r"leaves no camera", test_cameras=[f"cam0{i}" for i in range(4)])
-    content = (folder / "cam01.mp4").read_bytes()
-    (folder / "cam01.mp4").write_bytes(content[: len(content) // 2])
-    refused(r"cam01\.mp4.*(truncated|damaged)")
-    (folder / "cam01.mp4").write_bytes(b"no video")
-    refused(r"cam01\.mp4 cannot be decoded as a video")
-    (folder / "cam01.mp4").unlink()
-    refused(r"has 4 cameras, but .* holds 3 .*: cam00\.mp4, cam02\.mp4")
-    (folder / "cam01.mp4").write_bytes(content)
-    for column, value, match in (
+def test_damaged_and_missing_videos_are_named(copied):
+    path = copied / "cam01.mp4"
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    refuse(copied, r"cam01\.mp4.*(truncated|damaged)")
+    path.write_bytes(b"no video")
+    refuse(copied, r"cam01\.mp4 cannot be decoded as a video")
+    path.unlink()
+    refuse(copied, r"has 4 cameras, but .* holds 3 .*: cam00\.mp4, cam02\.mp4")
+
+
+def test_rows_of_poses_that_cannot_be(images):
+    path = images / "poses_bounds.npy"
+    poses = np.load(path)
+    for column, value, words in (
         (4, 0.0, "row 2 .*height is 0"),
         (14, np.nan, "focal length is nan"),
         (0, 3.0, "row 2 .*orthonormal"),
@@ -430,37 +406,36 @@ def test_damaged_files_are_named(videos, tmp_path):
     ):
         spoilt = poses.copy()
         spoilt[2, column] = value
-        np.save(folder / "poses_bounds.npy", spoilt)
-        refused(match)
-    np.save(folder / "poses_bounds.npy", poses[:, :16])
-    refused(r"not one row of 17 numbers")
-    np.save(folder / "poses_bounds.npy", np.array([{}]), allow_pickle=True)
-    refused(r"poses_bounds\.npy cannot be read")
-    (folder / "poses_bounds.npy").unlink()
-    refused(r"neither poses_bounds\.npy .* nor transforms\.json .*cam00\.mp4")
-    for name, match in (
+        np.save(path, spoilt)
+        refuse(images, words)
+    np.save(path, poses[:, :16])
+    refuse(images, r"not one row of 17 numbers")
+    np.save(path, np.array([{}]), allow_pickle=True)
+    refuse(images, r"poses_bounds\.npy cannot be read")
+
+
+def test_places_of_recordings_that_cannot_be(copied):
+    (copied / "poses_bounds.npy").unlink()
+    refuse(copied, r"neither poses_bounds\.npy .* nor transforms\.json .*cam00\.mp4")
+    (copied / "cam00").mkdir()
+    for name, words in (
         ("cam05.mp4", "is not a video"),
         ("../other", "leaves the scene's folder"),
         ("/cam05.mp4", "is not a video"),
         ("", "must be text"),
         (".", "is the scene's folder"),
+        (lambda camera: f"cam{camera:02d}.mp4" if camera else "cam00", "cam00 holds no images"),
+        ("cam01.mp4", r"another pose than .* data=nerfstudio"),
     ):
-        with_transforms(folder, lambda camera, name=name: name)
-        refused(match)
-    (folder / "cam00").mkdir()
-    with_transforms(folder, lambda camera: f"cam0{camera}" if camera == 0 else f"cam0{camera}.mp4")
-    refused(r"cam00 holds no images")
-    with_transforms(folder, lambda camera: "cam01.mp4")
-    refused(r"another pose than .* data=nerfstudio")
+        with_transforms(copied, name)
+        refuse(copied, words)
 
 
-def test_cameras_of_images_need_no_pyav(tmp_path, monkeypatch, videos):
-    folder = neural_3d_video(tmp_path / "scene", write_images, "")
+def test_cameras_of_images_need_no_pyav(images, monkeypatch, videos):
     monkeypatch.setitem(__import__("sys").modules, "av", None)
-    assert len(read_cameras(folder)) == CAMERAS
-    assert len(read(folder).splits["train"]) == 3 * FRAMES
-    with pytest.raises(MissingExtraError, match=r'pip install "xplanes\[video\]"'):
-        read(videos)
+    assert len(read_cameras(images)) == CAMERAS
+    require_all(read(images))
+    refuse(videos, r'pip install "xplanes\[video\]"', error=MissingExtraError)
 
 
 def test_frames_that_an_edit_list_hides_are_not_counted(tmp_path):
@@ -492,25 +467,27 @@ def write_stamped(path: Path, frames: np.ndarray, stamps: list[int], **stream_op
         container.mux(stream.encode())
 
 
+def stamped(folder: Path, stamps: Callable[[int], list[int]]) -> Path:
+    """Videos of which each camera's frames have its own times."""
+
+    def write(path: Path, frames: np.ndarray) -> None:
+        write_stamped(path, frames, stamps(int(path.stem[-1])))
+
+    return neural_3d_video(folder / "scene", write, ".mkv")
+
+
 def test_times_of_variable_frame_rates_are_those_of_the_files(tmp_path):
-    folder = neural_3d_video(tmp_path / "scene", write_video, ".mkv")
     stamps = [0, 33, 67, 233, 267, 300]
-    for camera in range(CAMERAS):
-        write_stamped(folder / f"cam0{camera}.mkv", rgb(camera), stamps)
-    times = read(folder).splits["train"].times
+    times = read(stamped(tmp_path, lambda camera: stamps)).splits["train"].times
     assert times[:FRAMES].tolist() == pytest.approx([stamp / 300 for stamp in stamps], abs=0.01)
 
 
 def test_a_camera_that_begins_later_is_told_of(tmp_path):
-    folder = neural_3d_video(tmp_path / "scene", write_video, ".mkv")
-    for camera in range(CAMERAS):
-        late = 400 if camera == 2 else 0
-        stamps = [late + 33 * number for number in range(FRAMES)]
-        write_stamped(folder / f"cam0{camera}.mkv", rgb(camera), stamps)
-    with pytest.warns(UserWarning, match=r"cam02\.mkv begins 0\.4 s after .*trim the videos"):
-        assert read(folder).splits["train"].times[:FRAMES].tolist() == pytest.approx(
-            [number / (FRAMES - 1) for number in range(FRAMES)]
-        )
+    late = (0, 0, 400, 0)
+    folder = stamped(tmp_path, lambda camera: [late[camera] + 33 * n for n in range(FRAMES)])
+    with told(r"cam02\.mkv begins 0\.4 s after .*trim the videos"):
+        times = read(folder).splits["train"].times
+    assert torch.allclose(times[:FRAMES], torch.linspace(0, 1, FRAMES))
 
 
 def test_hdr_videos_are_told_of(tmp_path):

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 import torch
 from filelock import FileLock
-from PIL import Image
 
 from tests.balls import RAYS as NEAR
-from tests.balls import ball_views
+from tests.balls import ball_views, surrounding
+from tests.captures import save
+from tests.scenes.common import assert_even, drawn_pixels, numbered, same, stored
 from xplanes.errors import SceneError
 from xplanes.files import DAY, MARK, StorageError
 from xplanes.scenes import store
@@ -27,27 +28,24 @@ from xplanes.scenes.images import read_images as read_sized
 from xplanes.scenes.lenses import Lenses, LensModel
 from xplanes.scenes.matte import silhouette_of
 from xplanes.scenes.silhouettes import foreground, may_hold, textureless
-from xplanes.scenes.store import RUN, PixelFile, StoredImages
-from xplanes.scenes.views import Views, joined
+from xplanes.scenes.store import RUN, StoredImages
+from xplanes.scenes.views import Intrinsics, Views, joined
 from xplanes.streams import step_generator
 
 FRAME = cube_frame(1.4, torch.zeros(3))
 RAYS = replace(NEAR, per_batch=1000, skip_background=False)
 
 
-def pictures(folder: Path, sizes, *, alpha: bool, seed=0) -> list[Path]:
+def pictures(folder: Path, sizes, *, alpha: bool) -> list[Path]:
     """Noise as PNG files of some heights and widths."""
-    folder.mkdir(parents=True)
-    draw = np.random.default_rng(seed)
-    paths = []
-    for index, (height, width) in enumerate(sizes):
-        pixels = draw.integers(0, 256, (height, width, 4 if alpha else 3), dtype=np.uint8)
-        paths.append(folder / f"{index:03d}.png")
-        Image.fromarray(pixels).save(paths[-1])
+    draw = np.random.default_rng(0)
+    paths = [folder / f"{index:03d}.png" for index in range(len(sizes))]
+    for path, size in zip(paths, sizes, strict=True):
+        save(path, draw.integers(0, 256, (*size, 4 if alpha else 3), dtype=np.uint8))
     return paths
 
 
-def read_images(paths: list[Path], resolution: int | None, cache: Path | None = None):
+def read_images(paths: list[Path], resolution: int | None = None, cache: Path | None = None):
     native = native_sizes(paths)
     sizes = final_sizes(paths, native, resolution)
     return read_sized(paths, sizes, cache=cache), native, sizes
@@ -59,10 +57,23 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store, "IN_MEMORY", 0)
 
 
-def stored(views: Views) -> Views:
-    """The same views in a file."""
-    file = PixelFile.of(views.image(index) for index in range(len(views)))
-    return replace(views, images=StoredImages.all_of(file))
+@pytest.fixture
+def paths(tmp_path: Path, small: None) -> list[Path]:
+    """Six small images, which are too large for memory."""
+    return pictures(tmp_path / "scene", [(65, 65)] * 6, alpha=False)
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def users_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where images are stored if no cache is named."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("sys.platform", "linux")
+    return tmp_path / "home" / "xplanes" / "images"
 
 
 SIZES = [(130, 70), (64, 64), (63, 129), (1, 1)]
@@ -73,7 +84,7 @@ def test_a_file_holds_the_pixels_of_memory(tmp_path, monkeypatch, alpha):
     paths = pictures(tmp_path / "scene", SIZES, alpha=alpha)
     expected, native, sizes = read_images(paths, None)
     monkeypatch.setattr(store, "IN_MEMORY", 4 * 4 * 130 * 129 - 1)
-    images, *rest = read_images(paths, None, tmp_path / "cache")
+    images, *rest = read_images(paths, cache=tmp_path / "cache")
     assert isinstance(images, StoredImages)
     assert rest == [native, sizes] == [SIZES, SIZES]
     assert images.shape == expected.shape
@@ -148,92 +159,53 @@ def test_views_in_a_file_leave_room_for_the_same():
         assert scene_frame(stored(those)).scale == scene_frame(those).scale
 
 
-def numbered(sizes) -> Views:
-    """Opaque views whose pixels hold their view, row and column."""
-    images = []
-    for index, (height, width) in enumerate(sizes):
-        image = torch.full((height, width, 4), 255, dtype=torch.uint8)
-        image[..., 0] = index
-        image[..., 1] = torch.arange(height)[:, None]
-        image[..., 2] = torch.arange(width)
-        images.append(image)
-    views = ball_views(len(sizes), 0.5, size=8)
+def sized(sizes) -> Views:
+    """Views of some heights and widths."""
     size = torch.tensor(sizes)
-    focal, centre = torch.full((len(sizes), 2), 90.0), 0.5 * size.flip(1).double()
-    intrinsics = views.intrinsics.__class__(focal, centre, size)
-    return replace(views, images=StoredImages.all_of(PixelFile.of(images)), intrinsics=intrinsics)
+    intrinsics = Intrinsics(torch.full((len(sizes), 2), 90.0), 0.5 * size.flip(1).double(), size)
+    blank = torch.zeros(len(sizes), *size.amax(dim=0), 4, dtype=torch.uint8)
+    files = tuple(map(str, range(len(sizes))))
+    times = torch.linspace(0, 1, len(sizes))
+    return Views(blank, surrounding(len(sizes), 4.0), times, intrinsics, files)
 
 
 def test_every_pixel_is_drawn_as_often_as_any_other():
-    sizes = [(70, 130), (33, 64), (64, 5)]
-    views = numbered(sizes)
+    views = stored(numbered(sized([(70, 130), (33, 64), (64, 5)])))
     batches = RayBatches(views, FRAME, replace(RAYS, per_batch=3000), seed=0)
-    counts = torch.zeros(3, 256, 256)
-    for step in range(120):
-        batch = batches.draw(step)
-        view, row, column = (batch["target"] * 255).round().long().T
-        counts.index_put_((view, row, column), torch.ones(3000), accumulate=True)
-        if step == 0:
-            # Rays, times and colours are those of one pixel.
-            for index, (height, width) in enumerate(sizes):
-                own = view == index
-                assert (row[own] < height).all()
-                assert (column[own] < width).all()
-                _, expected = views.image_rays(index)
-                found = batch["directions"][own]
-                assert torch.allclose(found, expected[row[own] * width + column[own]], atol=1e-6)
-                assert (batch["times"][own] == views.times[index]).all()
-    drawn = torch.cat([counts[i, :h, :w].flatten() for i, (h, w) in enumerate(sizes)])
-    assert drawn.sum() == counts.sum() == 120 * 3000
-    assert drawn.min() > 0
-    expected = 120 * 3000 / views.pixels
+    counts = drawn_pixels(batches, 120)
+    assert not counts[~views.valid()].any()
+    assert counts[views.valid()].min() > 0
     # Pixels of one run are drawn together, which does not change how often, but spreads the counts
     # of whole runs.
-    assert abs(float(drawn.mean()) - expected) < 1e-3
     first = counts[0, :70, :130].flatten()
-    runs = first[:RUN].mean(), first[RUN : 2 * RUN].mean(), counts[1, :33, :64].mean()
-    for mean in runs:
-        assert float(mean) == pytest.approx(expected, rel=0.15)
-    within = first[:RUN]
-    chi_squared = float(((within - within.mean()) ** 2 / within.mean()).sum())
-    assert abs(chi_squared - (RUN - 1)) < 5 * (2 * RUN) ** 0.5
+    expected = 120 * 3000 / views.pixels
+    for run in (first[:RUN], first[RUN : 2 * RUN], counts[1, :33, :64]):
+        assert float(run.mean()) == pytest.approx(expected, rel=0.15)
+    assert_even(first[:RUN])
 
 
 def test_no_pixel_is_drawn_that_a_fisheye_lens_leaves_dark():
-    views = numbered([(150, 150)] * 2)
+    views = sized([(80, 80)] * 2)
     lenses = replace(Lenses.pinholes(2), model=torch.full((2,), int(LensModel.FISHEYE)), limit=None)
-    intrinsics = replace(views.intrinsics, focal=torch.full((2, 2), 30.0), lenses=lenses)
+    intrinsics = replace(views.intrinsics, focal=torch.full((2, 2), 16.0), lenses=lenses)
     shown = intrinsics.has_ray(0)
-    assert shown is not None
     assert 0.5 < shown.float().mean() < 0.99
-    images = [views.image(index).clone() for index in range(2)]
-    for image in images:
-        image[~shown] = 0
-    file = StoredImages.all_of(PixelFile.of(images))
-    views = replace(views, images=file, intrinsics=intrinsics)
+    views = numbered(replace(views, intrinsics=intrinsics))
+    views.images[:, ~shown] = 0
+    views = stored(views)
     assert views.is_opaque
-    batches = RayBatches(views, FRAME, replace(RAYS, per_batch=4000), seed=0)
+    batches = RayBatches(views, FRAME, RAYS, seed=0)
     assert batches.near_pixels + batches.far_pixels == 2 * int(shown.sum())
-    drawn = torch.zeros(150, 150)
-    for step in range(100):
-        batch = batches.draw(step)
-        assert (batch["alpha"] == 1).all()
-        row, column = (batch["target"][:, 1:] * 255).round().long().T
-        drawn.index_put_((row, column), torch.ones(4000), accumulate=True)
-        _, expected = views.image_rays(0)
-        own = (batch["target"][:, 0] * 255).round() == 0
-        place = row[own] * 150 + column[own]
-        assert torch.allclose(batch["directions"][own], expected[place], atol=1e-5)
-    assert not drawn[~shown].any()
-    assert drawn[shown].min() > 0
+    counts = drawn_pixels(batches, 150)
+    assert not counts[:, ~shown].any()
+    assert counts.sum(dim=0)[shown].min() > 0
 
 
 def test_runs_far_from_silhouettes_get_the_asked_share():
     views = stored(ball_views(3, 0.15, size=400))
     for share in (0.0, 0.2):
-        settings = replace(
-            RAYS, skip_background=True, background_share=share, background_jitter=0.2
-        )
+        shares = {"background_share": share, "background_jitter": 0.2}
+        settings = replace(RAYS, skip_background=True, **shares)
         batches = RayBatches(views, FRAME, settings, seed=0)
         assert batches.near_pixels + batches.far_pixels == views.pixels
         natural = batches.far_pixels / views.pixels
@@ -251,18 +223,15 @@ def test_runs_far_from_silhouettes_get_the_asked_share():
         assert lit == pytest.approx((1 - share) * shown / (1 - natural), rel=0.25)
 
 
-def test_a_batch_from_a_file_depends_on_seed_step_and_rank_alone(tmp_path, small):
-    paths = pictures(tmp_path / "scene", [(200, 200)] * 4, alpha=False)
-    images, *_ = read_images(paths, None, tmp_path / "cache")
-    views = replace(ball_views(4, 0.5, size=200), images=images)
+def test_a_batch_from_a_file_depends_on_seed_step_and_rank_alone(paths, cache):
+    views = replace(ball_views(6, 0.5, size=65), images=read_images(paths, cache=cache)[0])
     settings = replace(RAYS, background="random")
     used = RayBatches(views, FRAME, settings, seed=3)
     for step in (0, 1, 2, 70, 5):
         used.draw(step)
     for step in (0, 1, AHEAD, 10**9):
         fresh = RayBatches(views, FRAME, settings, seed=3)
-        one, other = fresh.draw(step), used.draw(step)
-        assert all(torch.equal(one[name], other[name]) for name in one), step
+        assert same(fresh.draw(step), used.draw(step)), step
     for seed, rank in ((4, 0), (3, 1)):
         other = RayBatches(views, FRAME, settings, seed=seed, rank=rank).draw(0)
         assert not torch.equal(other["directions"], used.draw(0)["directions"])
@@ -272,20 +241,19 @@ def test_a_batch_from_a_file_depends_on_seed_step_and_rank_alone(tmp_path, small
 
 
 def test_runs_of_coming_steps_are_announced_once(monkeypatch):
-    views = numbered([(200, 200)] * 3)
+    views = stored(ball_views(3, 0.5, size=200))
     told: list[tuple[int, int]] = []
     read: list[tuple[int, int]] = []
     of_runs = StoredImages.pixels
-    monkeypatch.setattr(
-        StoredImages,
-        "prefetch",
-        lambda self, view, run: told.extend(zip(view.tolist(), run.tolist(), strict=True)),
-    )
+
+    def prefetch(self, view, run):
+        told.extend(zip(view.tolist(), run.tolist(), strict=True))
 
     def pixels(self, view, run, inside):
         read.extend(zip(view.tolist(), run.tolist(), strict=True))
         return of_runs(self, view, run, inside)
 
+    monkeypatch.setattr(StoredImages, "prefetch", prefetch)
     monkeypatch.setattr(StoredImages, "pixels", pixels)
     batches = RayBatches(views, FRAME, RAYS, seed=0)
     for step in range(5, 9):
@@ -300,9 +268,8 @@ def test_draws_from_memory_are_those_of_scattered_pixels():
     for skip in (False, True):
         batches = RayBatches(views, FRAME, replace(RAYS, skip_background=skip), seed=7, rank=2)
         batch = batches.draw(11)
-        uniform = torch.rand(
-            1000, 3, generator=step_generator(7, 11, 2), dtype=torch.float64
-        ).numpy()
+        generator = step_generator(7, 11, 2)
+        uniform = torch.rand(1000, 3, generator=generator, dtype=torch.float64).numpy()
         near = foreground(views, [1] * 5).numpy().ravel()
         even = textureless(views, [1] * 5).numpy().ravel() & near & skip
         far, even, rest = (np.flatnonzero(kind) for kind in (~near, even, near & ~even))
@@ -326,98 +293,78 @@ def private_bytes() -> int:
 
 
 @pytest.mark.skipif(not Path("/proc/self/smaps_rollup").is_file(), reason="needs Linux's /proc")
-def test_drawing_takes_no_memory_of_the_images(tmp_path, small, capsys):
+def test_drawing_takes_no_memory_of_the_images(tmp_path, small, cache, capsys):
     size, count = (1024, 1024), 20
+    (tmp_path / "source").write_bytes(b"")
+    whole = 3 * count * size[0] * size[1]  # 63 MB
+    before = private_bytes()
 
     def job(index):
         return lambda: [(index, np.full((*size, 3), index, np.uint8))]
 
-    source = tmp_path / "source"
-    source.write_bytes(b"")
-    whole = 3 * count * size[0] * size[1]  # 63 MB
-    before = private_bytes()
     jobs = [job(i) for i in range(count)]
-    images = store.images([size] * count, jobs, [source], "test", lambda: False, tmp_path / "cache")
+    source = [tmp_path / "source"]
+    images = store.images([size] * count, jobs, source, "test", lambda: False, cache)
     poses = ball_views(count, 0.5, size=4)
-    batches = RayBatches(
-        Views(images, poses.camera_to_world, poses.times, 1000.0, poses.files), FRAME, RAYS, seed=0
-    )
+    views = Views(images, poses.camera_to_world, poses.times, 1000.0, poses.files)
+    batches = RayBatches(views, FRAME, RAYS, seed=0)
     for step in range(100):
         batches.draw(step)
     assert images.nbytes == whole
     assert private_bytes() - before < whole / 3
     said = capsys.readouterr().out
-    assert "20 images of up to 1024x1024 px" in said
-    assert "0.1 GB" in said
-    assert str(tmp_path / "cache") in said
+    for words in ("20 images of up to 1024x1024 px", "0.1 GB", str(cache)):
+        assert words in said
 
 
-def test_the_cache_is_used_again_until_a_source_changes(tmp_path, small, capsys):
-    paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=False)
-    cache = tmp_path / "cache"
-    first = read_images(paths, None, cache)[0]
+def test_the_cache_is_used_again_until_a_source_changes(tmp_path, paths, cache, capsys):
+    first = read_images(paths, cache=cache)[0]
     assert "decoding" in capsys.readouterr().out
-    again = read_images(paths, None, cache)[0]
+    again = read_images(paths, cache=cache)[0]
     assert not capsys.readouterr().out
     assert again.identity == first.identity
-    other = Image.fromarray(np.full((65, 65, 3), 9, np.uint8))
-    other.save(paths[1])
-    changed = read_images(paths, None, cache)[0]
+    save(paths[1], np.full((65, 65, 3), 9, np.uint8))
+    changed = read_images(paths, cache=cache)[0]
     assert (changed.image(1)[..., :3] == 9).all()
     assert torch.equal(changed.image(0), first.image(0))
     # One second later with the same content is another file, too.
     os.utime(paths[2], ns=(0, 10**9))
-    assert read_images(paths, None, cache)[0].identity != changed.identity
-    assert sorted(path.suffix for path in cache.iterdir()).count(".pixels") == 3
-    assert not [path for path in (tmp_path / "scene").iterdir() if path.suffix != ".png"]
+    assert read_images(paths, cache=cache)[0].identity != changed.identity
+    assert len(list(cache.glob("*.pixels"))) == 3
+    assert sorted((tmp_path / "scene").iterdir()) == paths
 
 
-def test_a_file_that_was_cut_off_is_made_anew(tmp_path, small):
-    paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=True)
-    images = read_images(paths, None, tmp_path / "cache")[0]
-    (path,) = (tmp_path / "cache").glob("*.pixels")
+def test_a_file_that_was_cut_off_is_made_anew(paths, cache):
+    images = read_images(paths, cache=cache)[0]
+    (path,) = cache.glob("*.pixels")
     expected = images.image(2)
     os.truncate(path, 1000)
     with pytest.raises(StorageError, match=r"ends too early.*Delete it"):
         images.image(2)
-    again = read_images(paths, None, tmp_path / "cache")[0]
-    assert torch.equal(again.image(2), expected)
+    assert torch.equal(read_images(paths, cache=cache)[0].image(2), expected)
 
 
-def test_a_damaged_image_leaves_nothing_behind(tmp_path, small):
-    paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=False)
+def test_a_damaged_image_leaves_nothing_behind(paths, cache):
     content = paths[1].read_bytes()
     paths[1].write_bytes(content[: len(content) // 2])
     with pytest.raises(SceneError, match=r"001\.png cannot be decoded"):
-        read_images(paths, None, tmp_path / "cache")
-    assert not [p for p in (tmp_path / "cache").iterdir() if p.suffix != ".lock"]
+        read_images(paths, cache=cache)
+    assert not [path for path in cache.iterdir() if path.suffix != ".lock"]
     paths[1].write_bytes(content)
-    assert read_images(paths, None, tmp_path / "cache")[0].shape[0] == 3
+    assert read_images(paths, cache=cache)[0].shape[0] == 6
 
 
-def test_a_disk_without_space_is_refused_first(tmp_path, small, monkeypatch):
-    paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=False)
-    usage = shutil.disk_usage(tmp_path)._replace(free=2**28 + 100)
+def test_a_disk_without_space_is_refused_first(paths, cache, monkeypatch):
+    usage = shutil.disk_usage(cache.parent)._replace(free=2**28 + 100)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     with pytest.raises(StorageError, match=r"0\.3 GB free.*data\.cache"):
-        read_images(paths, None, tmp_path / "cache")
-    assert not list((tmp_path / "cache").glob("*.pixels"))
+        read_images(paths, cache=cache)
+    assert not list(cache.glob("*.pixels"))
 
 
-def test_the_cache_is_the_users_if_none_is_named(tmp_path, small, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr("sys.platform", "linux")
-    paths = pictures(tmp_path / "scene", [(65, 65)], alpha=False)
-    read_images(paths, None)
-    assert len(list((tmp_path / "home" / "xplanes" / "images").glob("*.pixels"))) == 1
-
-
-def test_what_no_run_has_used_for_a_month_is_removed(tmp_path, small, monkeypatch, capsys):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr("sys.platform", "linux")
-    cache = tmp_path / "home" / "xplanes" / "images"
-    paths = pictures(tmp_path / "scene", [(65, 65)] * 6, alpha=False)
-    read_images(paths[:1], None)
+def test_what_no_run_has_used_for_a_month_is_removed(paths, users_cache, capsys):
+    cache = users_cache
+    read_images(paths[:1])
     assert "after 30 days without use" in capsys.readouterr().out
     (old,) = cache.glob("*.pixels")
 
@@ -438,37 +385,36 @@ def test_what_no_run_has_used_for_a_month_is_removed(tmp_path, small, monkeypatc
     ]
     gone = [
         aged(cache / f"{'7' * 32}.tiles", 31),  # Of an earlier version.
-        *[aged(cache / f".{'5' * 32}.pixels{MARK}x", 2), aged(cache / f"{'6' * 32}.pixels", 31)],
+        aged(cache / f".{'5' * 32}.pixels{MARK}x", 2),
+        aged(cache / f"{'6' * 32}.pixels", 31),
     ]
     # Use makes a file young again.
     aged(old, 31)
-    images = read_images(paths[:1], None)[0]
+    images = read_images(paths[:1])[0]
     with FileLock(locked.with_suffix(".lock")):
-        read_images(paths[1:3], None)
+        read_images(paths[1:3])
     assert [path for path in [old, *kept, *gone] if path.exists()] == [old, *kept]
     assert "removed 0.0 GB of decoded images" in capsys.readouterr().out
     # A reader keeps what it has opened; the next one decodes it again.
     aged(old, 31)
     expected = images.image(0).clone()
-    read_images(paths[3:], None)
+    read_images(paths[3:])
     assert not old.exists()
     assert not locked.exists()
     assert torch.equal(images.image(0), expected)
-    assert torch.equal(read_images(paths[:1], None)[0].image(0), expected)
+    assert torch.equal(read_images(paths[:1])[0].image(0), expected)
 
 
-def test_a_cache_that_is_named_is_the_users_to_clean(tmp_path, small, capsys):
-    paths = pictures(tmp_path / "scene", [(65, 65)] * 3, alpha=False)
-    cache = tmp_path / "cache"
-    read_images(paths[:1], None, cache)
+def test_a_cache_that_is_named_is_the_users_to_clean(paths, cache, capsys):
+    read_images(paths[:1], cache=cache)
     assert "without use" not in capsys.readouterr().out
     (old,) = cache.glob("*.pixels")
     os.utime(old, (0, 0))
-    read_images(paths[1:], None, cache)
+    read_images(paths[1:], cache=cache)
     assert old.exists()
 
 
-def test_an_interrupted_decoder_stops_soon(tmp_path, small):
+def test_an_interrupted_decoder_stops_soon(tmp_path, small, cache):
     source = tmp_path / "source"
     source.write_bytes(b"")
     begun = threading.Event()
@@ -486,37 +432,31 @@ def test_an_interrupted_decoder_stops_soon(tmp_path, small):
 
     began = time.monotonic()
     with pytest.raises(SceneError, match="camera 7"):
-        store.images(
-            [(4, 4)] * 101, [slow, broken], [source], "", lambda: False, tmp_path / "cache"
-        )
+        store.images([(4, 4)] * 101, [slow, broken], [source], "", lambda: False, cache)
     assert time.monotonic() - began < 1.5
 
 
-def test_files_on_a_read_only_disk_are_read(tmp_path, small, monkeypatch):
-    paths = pictures(tmp_path / "scene", [(65, 65)] * 2, alpha=False)
-    first = read_images(paths, None, cache=tmp_path / "cache")[0]
+def refuse(*_: object, **__: object) -> None:
+    raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
+def test_files_on_a_read_only_disk_are_read(paths, cache, monkeypatch):
+    first = read_images(paths, cache=cache)[0]
     monkeypatch.setattr(os, "utime", refuse)
-    again = read_images(paths, None, cache=tmp_path / "cache")[0]
+    again = read_images(paths, cache=cache)[0]
     assert isinstance(again, StoredImages)
     assert isinstance(first, StoredImages)
     assert torch.equal(again.image(1), first.image(1))
 
 
-def test_a_cache_that_cannot_be_written_is_named(tmp_path, small, monkeypatch):
-    paths = pictures(tmp_path / "scene", [(65, 65)] * 2, alpha=False)
-    file = tmp_path / "file"
-    file.write_text("")
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    for home in (lambda: file, homeless):
-        monkeypatch.setattr(Path, "home", home)
-        with pytest.raises(StorageError, match=r"cannot be written: .*data\.cache names the one"):
-            read_images(paths, None)
-    assert read_images(paths, None, cache=tmp_path / "cache")[0].image(0).shape == (65, 65, 4)
-
-
 def homeless() -> Path:
     raise RuntimeError("Could not determine home directory.")
+
+
+def test_a_cache_that_cannot_be_written_is_named(paths, cache, monkeypatch):
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    for home in (lambda: paths[0], homeless):
+        monkeypatch.setattr(Path, "home", home)
+        with pytest.raises(StorageError, match=r"cannot be written: .*data\.cache names the one"):
+            read_images(paths)
+    assert read_images(paths, cache=cache)[0].image(0).shape == (65, 65, 4)

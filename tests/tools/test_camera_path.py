@@ -42,6 +42,7 @@ SHOTS = ((40.0, 0.75), (55.0, 0.25))
 
 def nerfstudio(views: Views, **changed: Any) -> dict[str, Any]:
     """Two cameras of training views, with different fields of view."""
+    poses = views.camera_to_world[:2].flatten(1).tolist()
     return {
         "camera_type": "perspective",
         "render_height": 12,
@@ -49,11 +50,8 @@ def nerfstudio(views: Views, **changed: Any) -> dict[str, Any]:
         "seconds": 0.5,
         "keyframes": [],
         "camera_path": [
-            {
-                "camera_to_world": views.camera_to_world[index].flatten().tolist(),
-                **{"fov": fov, "aspect": 20 / 12, "render_time": time},
-            }
-            for index, (fov, time) in enumerate(SHOTS)
+            {"camera_to_world": pose, "fov": fov, "aspect": 20 / 12, "render_time": time}
+            for pose, (fov, time) in zip(poses, SHOTS, strict=True)
         ],
         **changed,
     }

@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.refusals import assert_refused
 from xplanes.errors import ConfigError, SceneError
 from xplanes.rendering.pictures import to_bytes
 from xplanes.scenes.cameras import PosedCamera
@@ -34,8 +36,13 @@ def write(path: Path, content: Any) -> Path:
     return path
 
 
+SHOTS = ((40.0, 0.75), (55.0, 0.25))
+"""Fields of view and times of two frames."""
+
+
 def nerfstudio(views: Views, **changed: Any) -> dict[str, Any]:
     """Two cameras of training views, with different fields of view."""
+    poses = views.camera_to_world[:2].flatten(1).tolist()
     return {
         "camera_type": "perspective",
         "render_height": 12,
@@ -43,13 +50,8 @@ def nerfstudio(views: Views, **changed: Any) -> dict[str, Any]:
         "seconds": 0.5,
         "keyframes": [],
         "camera_path": [
-            {"camera_to_world": pose.flatten().tolist(), "fov": fov, "aspect": 20 / 12, **times}
-            for pose, fov, times in zip(
-                views.camera_to_world[:2],
-                (40.0, 55.0),
-                ({"render_time": 0.75}, {"render_time": 0.25}),
-                strict=True,
-            )
+            {"camera_to_world": pose, "fov": fov, "aspect": 20 / 12, "render_time": time}
+            for pose, (fov, time) in zip(poses, SHOTS, strict=True)
         ],
         **changed,
     }
@@ -63,7 +65,7 @@ def transforms(views: Views, **changed: Any) -> dict[str, Any]:
 def test_a_frame_is_the_render_from_its_camera_at_its_time(trained, views, tmp_path):
     path = write(tmp_path / "camera_path.json", nerfstudio(views))
     folder = render_video(trained, VideoOptions(str(path), out=f"{tmp_path}/frames/"))
-    for index, (fov, time) in enumerate(((40, 0.75), (55, 0.25))):
+    for index, (fov, time) in enumerate(SHOTS):
         focal = 6 / math.tan(math.radians(fov / 2))
         rays = PosedCamera(views.camera_to_world[index], focal, 12, 20).rays()
         image = trained.module.renderer.image(
@@ -101,28 +103,29 @@ def test_times_of_a_spline_that_overshoots_stay_in_range(views, tmp_path, caplog
 
 
 def test_damaged_paths_are_refused(views, tmp_path):
-    def entry(**changed: Any) -> dict[str, Any]:
-        first, second = nerfstudio(views)["camera_path"]
-        return nerfstudio(views, camera_path=[first, {**second, **changed}])
+    path, usual = tmp_path / "a.json", nerfstudio(views)
 
-    refused = [
+    def entry(**changed: Any) -> dict[str, Any]:
+        first, second = usual["camera_path"]
+        return {**usual, "camera_path": [first, {**second, **changed}]}
+
+    for content, words in [
         ([], "must hold a JSON object"),
         ({}, 'Its key "camera_path"'),
-        (nerfstudio(views, camera_path=[]), "holds no cameras"),
-        (nerfstudio(views, camera_path=[3]), r"camera_path\[0\] is 3"),
-        (nerfstudio(views, camera_type="fisheye"), "camera_type is 'fisheye'"),
-        (nerfstudio(views, render_width=0), "render_width is 0"),
+        ({**usual, "camera_path": []}, "holds no cameras"),
+        ({**usual, "camera_path": [3]}, r"camera_path\[0\] is 3"),
+        ({**usual, "camera_type": "fisheye"}, "camera_type is 'fisheye'"),
+        ({**usual, "render_width": 0}, "render_width is 0"),
         (entry(fov=180), r"camera_path\[1\]: fov is 180"),
         (entry(render_time=None), r"camera_path\[1\]: render_time is None"),
         (entry(render_time=1.5), r"camera_path\[1\]: render_time is 1.5"),
         (entry(camera_to_world=[1.0] * 11), r"camera_path\[1\]: camera_to_world must be"),
         (transforms(views, camera_angle_x=None), "camera_angle_x is None"),
-    ]
-    for content, words in refused:
-        with pytest.raises(SceneError, match=words):
-            read_camera_path(write(tmp_path / "a.json", content))
-    with pytest.raises(SceneError, match="no such camera path"):
-        VideoOptions(path=str(tmp_path / "none.json")).check()
+    ]:
+        call = partial(read_camera_path, write(path, content))
+        assert_refused(SceneError, words, call, content)
+    path.unlink()
+    assert_refused(SceneError, "no such camera path", VideoOptions(path=str(path)).check, "no file")
 
 
 def test_options_that_contradict_the_path_are_refused(views, tmp_path):

@@ -3,25 +3,26 @@ import io
 import json
 import os
 import shutil
-import threading
 import zipfile
 from collections import namedtuple
 from functools import partial
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from itertools import product
+from http.server import BaseHTTPRequestHandler
 from unittest.mock import patch
 
 import pytest
 
+from tests.local_server import serving
 from tests.refusals import assert_refused
 from xplanes.errors import SceneError
 from xplanes.files import StorageError
-from xplanes.tools import download as download_module
-from xplanes.tools import download as fetch_module
+from xplanes.tools import download as module
 from xplanes.tools.download import DNERF_URL, TRAIN_VIEWS, download_dnerf
 
 VIEWS = {name: count // 25 for name, count in TRAIN_VIEWS.items()}
 """Numbers of training views in these tests, but for those that want the published ones."""
+
+BY_HAND = (DNERF_URL, "by hand", "{root}/dnerf.zip", "data=demo")
+"""What a message says where the archive cannot be fetched."""
 
 COPIES = 60
 """How often the text of an image repeats, for an archive of some size."""
@@ -31,19 +32,15 @@ def make_archive(*, top="data/", skip=(), extra=(), train_views=None, held_out=2
     """A zip in the shape of the D-NeRF archive, with some text for every image."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        for scene, train in ({**VIEWS, **(train_views or {})}).items():
+        for scene, train in {**VIEWS, **(train_views or {})}.items():
             for split, count in (("train", train), ("val", held_out), ("test", held_out)):
-                frames = [{"file_path": f"./{split}/r_{i:03}"} for i in range(count)]
-                files = [f"{scene}/{split}/r_{i:03}.png" for i in range(count)]
-                listing = f"{scene}/transforms_{split}.json"
-                for name, text in [
-                    (listing, json.dumps({"frames": frames})),
-                    *((file, file * COPIES) for file in files),
-                ]:
-                    if name not in skip:
-                        archive.writestr(top + name, text)
-        archive.writestr("__MACOSX/data/lego/._r_000.png", "junk")
-        for name in extra:
+                names = [f"{split}/r_{i:03}" for i in range(count)]
+                listed = {"frames": [{"file_path": f"./{name}"} for name in names]}
+                files = {f"{scene}/transforms_{split}.json": json.dumps(listed)}
+                files |= {f"{scene}/{name}.png": f"{scene}/{name}.png" * COPIES for name in names}
+                for name in filter(lambda name: name not in skip, files):
+                    archive.writestr(top + name, files[name])
+        for name in ("__MACOSX/data/lego/._r_000.png", *extra):
             archive.writestr(name, "junk")
     return content.getvalue()
 
@@ -54,34 +51,39 @@ def archive():
 
 
 class Handler(BaseHTTPRequestHandler):
+    """Answers with an archive, or as its attributes say, which tests change."""
+
+    content: bytes
+    requests: list
+    limits: list  # Bytes after which each answer is cut off.
+    status = 200
+    etag = '"one"'
+    ranges = True
+    ignores_if_range = False
+    sends_length = True
+    content_type = "application/zip"
+
     def do_GET(self):
-        server = self.server
-        server.requests.append(dict(self.headers))
-        if server.status != 200:
-            self.send_error(server.status)
+        self.requests.append(dict(self.headers))
+        if self.status != 200:
+            self.send_error(self.status)
             return
-        body, start = server.content, 0
+        code, start, size = 200, 0, len(self.content)
+        headers = {"ETag": self.etag, "Content-Type": self.content_type}
         asked = self.headers.get("Range")
-        unchanged = self.headers.get("If-Range") == server.etag or server.ignores_if_range
-        if asked and server.ranges and unchanged:
+        unchanged = self.headers.get("If-Range") == self.etag or self.ignores_if_range
+        if asked and self.ranges and unchanged:
             start = int(asked.removeprefix("bytes=").removesuffix("-"))
-            if start >= len(body):
-                self.send_response(416)
-                self.send_header("Content-Range", f"bytes */{len(body)}")
-                self.end_headers()
-                return
-            self.send_response(206)
-            self.send_header("Content-Range", f"bytes {start}-{len(body) - 1}/{len(body)}")
-        else:
-            self.send_response(200)
-        if server.etag:
-            self.send_header("ETag", server.etag)
-        if server.sends_length:
-            self.send_header("Content-Length", str(len(body) - start))
-        self.send_header("Content-Type", server.content_type)
+            code, served = (206, f"{start}-{size - 1}") if start < size else (416, "*")
+            headers["Content-Range"] = f"bytes {served}/{size}"
+        if self.sends_length:
+            headers["Content-Length"] = str(max(0, size - start))
+        self.send_response(code)
+        for name, value in headers.items():
+            if value is not None:
+                self.send_header(name, value)
         self.end_headers()
-        limit = server.limits.pop(0) if server.limits else None
-        self.wfile.write(body[start:][:limit])
+        self.wfile.write(self.content[start:][: self.limits.pop(0) if self.limits else None])
         self.close_connection = True
 
     def log_message(self, *_):
@@ -90,71 +92,57 @@ class Handler(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def server(archive, monkeypatch):
-    monkeypatch.setenv("no_proxy", "*")
-    monkeypatch.setattr(fetch_module, "PAUSE_SECONDS", 0.01)
-    monkeypatch.setattr(download_module, "TRAIN_VIEWS", VIEWS)
-    monkeypatch.setattr(download_module, "TEST_VIEWS", 2)
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        server.content = archive
-        server.requests = []
-        server.limits = []  # bytes after which each answer is cut off
-        server.status = 200
-        server.etag = '"one"'
-        server.ranges = True
-        server.ignores_if_range = False
-        server.sends_length = True
-        server.content_type = "application/zip"
-        server.url = f"http://127.0.0.1:{server.server_port}/data.zip"
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        yield server
-        server.shutdown()
-        thread.join()
+    monkeypatch.setattr(module, "PAUSE_SECONDS", 0.01)
+    monkeypatch.setattr(module, "TRAIN_VIEWS", VIEWS)
+    monkeypatch.setattr(module, "TEST_VIEWS", 2)
+    handler = type("Server", (Handler,), {"content": archive, "requests": [], "limits": []})
+    with serving(handler, monkeypatch) as address:
+        handler.url = f"{address}/data.zip"
+        yield handler
 
 
-def download(root, server, **arguments):
+def download(root, server):
+    """Download, and return what was said."""
     lines = []
-    with patch.object(download_module, "say", lines.append):
-        result = download_dnerf(root, url=server.url, **arguments)
-    return result, lines
+    with patch.object(module, "say", lines.append):
+        assert download_dnerf(root, url=server.url) == root
+    return lines
 
 
-def error(root, server, **arguments):
-    call = partial(download, root, server, **arguments)
-    return assert_refused(SceneError, "", call, arguments)
+def error(root, server):
+    return assert_refused(SceneError, "", partial(download, root, server), server.url)
 
 
-def assert_complete(root, views=VIEWS, case=None):
-    assert sorted(path.name for path in root.iterdir()) == sorted(views), case
+def assert_complete(root, views=VIEWS):
+    assert sorted(path.name for path in root.iterdir()) == sorted(views)
     for scene, count in views.items():
-        assert len(list((root / scene / "train").iterdir())) == count, case
-        assert (root / scene / "val" / "r_001.png").read_text() == (
-            f"{scene}/val/r_001.png" * COPIES
-        ), case
+        assert len(list((root / scene / "train").iterdir())) == count
+        shown = (root / scene / "val" / "r_001.png").read_text()
+        assert shown == f"{scene}/val/r_001.png" * COPIES
+
+
+def change(server, **attributes):
+    for name, value in attributes.items():
+        setattr(server, name, value)
 
 
 def scenes_in(root):
-    return [path.name for path in root.iterdir() if path.is_dir()]
+    return sorted(path.name for path in root.iterdir() if path.is_dir())
 
 
 def test_downloads_and_unpacks_all_scenes(tmp_path, server, monkeypatch):
-    monkeypatch.setattr(download_module, "TRAIN_VIEWS", TRAIN_VIEWS)
-    monkeypatch.setattr(download_module, "TEST_VIEWS", 20)
+    monkeypatch.setattr(module, "TRAIN_VIEWS", TRAIN_VIEWS)
+    monkeypatch.setattr(module, "TEST_VIEWS", 20)
     server.content = make_archive(train_views=TRAIN_VIEWS, held_out=20)
     root = tmp_path / "data" / "dnerf"
-    result, lines = download(root, server)
-    assert result == root
+    lines = download(root, server)
     assert_complete(root, TRAIN_VIEWS)
     assert server.url in lines[0]
     assert "lego" in lines[-1]
     assert not any("Note" in line for line in lines)
-
-
-def test_nothing_is_fetched_when_all_is_there(tmp_path, server):
-    download(tmp_path, server)
-    _, lines = download(tmp_path, server)
+    # All is there now.
+    assert "already" in download(root, server)[0]
     assert len(server.requests) == 1
-    assert "already" in lines[0]
 
 
 def test_scenes_already_there_are_kept(tmp_path, server):
@@ -162,7 +150,7 @@ def test_scenes_already_there_are_kept(tmp_path, server):
     (tmp_path / "lego" / "transforms_train.json").write_text("mine")
     download(tmp_path, server)
     assert (tmp_path / "lego" / "transforms_train.json").read_text() == "mine"
-    assert sorted(scenes_in(tmp_path)) == sorted(VIEWS)
+    assert scenes_in(tmp_path) == sorted(VIEWS)
 
 
 def test_a_folder_in_the_way_is_not_touched(tmp_path, server):
@@ -172,13 +160,6 @@ def test_a_folder_in_the_way_is_not_touched(tmp_path, server):
     assert str(tmp_path / "lego") in message
     assert "Move it" in message
     assert not server.requests
-
-
-def part_of(root, content, **note):
-    """A download that was cut off, and what was noted of it."""
-    part = root / "dnerf.zip.part"
-    part.write_bytes(content)
-    part.with_name("dnerf.zip.part.json").write_text(json.dumps(note))
 
 
 @pytest.mark.parametrize(
@@ -195,9 +176,8 @@ def part_of(root, content, **note):
 )
 def test_a_cut_is_made_up_for_whatever_the_server_can_do(tmp_path, server, changes, asked):
     server.limits = [50_000]
-    for name, value in changes.items():
-        setattr(server, name, value)
-    _, lines = download(tmp_path, server)
+    change(server, **changes)
+    lines = download(tmp_path, server)
     assert_complete(tmp_path)
     ranges = [request.get("Range") for request in server.requests]
     assert ranges == [None, asked][: len(ranges)]
@@ -206,119 +186,97 @@ def test_a_cut_is_made_up_for_whatever_the_server_can_do(tmp_path, server, chang
     assert noted == (len(VIEWS) if "content" in changes else 0)
 
 
-def test_a_part_of_unknown_origin_is_not_continued(tmp_path, server):
-    part_of(tmp_path, b"old", url="elsewhere", validator="one")
+@pytest.mark.parametrize("ignores_if_range", [False, True])
+@pytest.mark.parametrize(
+    ("size", "note", "asks_for_the_rest"),
+    [
+        (1000, {"url": "elsewhere"}, False),
+        (1000, {"validator": '"zero"'}, True),
+        (10_000_000, {"validator": '"zero"'}, True),
+        (None, {}, True),
+    ],
+    ids=["unknown origin", "of another file", "of a larger file", "complete"],
+)
+def test_a_part_that_is_there_serves_if_it_is_of_this_file(
+    tmp_path, server, ignores_if_range, size, note, asks_for_the_rest
+):
+    part = tmp_path / "dnerf.zip.part"
+    part.write_bytes(server.content if size is None else bytes(size))
+    noted = {"url": server.url, "validator": '"one"', **note}
+    part.with_name(f"{part.name}.json").write_text(json.dumps(noted))
+    server.ignores_if_range = ignores_if_range
     download(tmp_path, server)
-    assert "Range" not in server.requests[0]
+    assert ("Range" in server.requests[0]) == asks_for_the_rest
+    assert size is not None or len(server.requests) == 1
     assert_complete(tmp_path)
 
 
-def test_resumes_at_the_next_call_after_a_cut(tmp_path, server, monkeypatch):
-    monkeypatch.setattr(fetch_module, "ATTEMPTS", 1)
+@pytest.mark.parametrize("page_in_between", [False, True])
+def test_a_call_after_a_cut_goes_on(tmp_path, server, monkeypatch, page_in_between):
+    monkeypatch.setattr(module, "ATTEMPTS", 1)
     server.limits = [50_000]
     message = error(tmp_path, server)
     assert "ended after 0.1 of" in message
     assert "dnerf.zip.part" in message
     assert scenes_in(tmp_path) == []
+    if page_in_between:
+        page = {"content": b"<html>Busy</html>", "content_type": "text/html", "ranges": False}
+        with patch.multiple(server, **page):
+            assert "web page" in error(tmp_path, server)
+        assert (tmp_path / "dnerf.zip.part").stat().st_size == 50_000
     download(tmp_path, server)
-    assert server.requests[1]["Range"] == "bytes=50000-"
-    assert server.requests[1]["If-Range"] == '"one"'
+    assert server.requests[-1]["Range"] == "bytes=50000-"
+    assert server.requests[-1]["If-Range"] == '"one"'
     assert_complete(tmp_path)
 
 
-def test_a_complete_part_is_not_fetched_again(tmp_path, server):
-    part_of(tmp_path, server.content, url=server.url, validator='"one"')
-    download(tmp_path, server)
-    assert len(server.requests) == 1
-    assert_complete(tmp_path)
+def flipped(content):
+    """An archive with a wrong bit in an image."""
+    name, changed = b"trex/test/r_001.png", bytearray(content)
+    changed[content.index(name, content.index(b"data/" + name) + 10)] ^= 0xFF
+    return bytes(changed)
 
 
-def test_a_changed_file_is_fetched_from_its_start(tmp_path, server):
-    for ignores_if_range, size in product((False, True), (1000, 10_000_000)):
-        case = f"If-Range ignored: {ignores_if_range}, {size} bytes"
-        root = tmp_path / f"{ignores_if_range} {size}"
-        root.mkdir()
-        part_of(root, b"old" * (size // 3), url=server.url, validator='"zero"')
-        server.ignores_if_range = ignores_if_range
-        server.requests.clear()
-        download(root, server)
-        assert "Range" in server.requests[0], case
-        assert_complete(root, case=case)
+REFUSED = [
+    ({"content": make_archive()[:-100]}, ["dnerf.zip", "damaged"]),
+    ({"content": flipped(make_archive())}, ["CRC", "r_001.png"]),
+    *(
+        ({"content": make_archive(**changes)}, words)
+        for changes, *words in (
+            ({"skip": ["trex/transforms_val.json"]}, "trex/transforms_val.json is missing"),
+            ({"skip": ["hook/test/r_000.png"]}, "hook lacks ./test/r_000.png"),
+            ({"train_views": {"lego": 1}}, "lego has 1 training views instead of 2"),
+            ({"extra": ["../evil"]}, "evil", "leads out"),
+            ({"extra": ["data/../../evil"]}, "evil", "leads out"),
+            ({"extra": ["/evil"]}, "evil", "leads out"),
+            ({"extra": ["data\\..\\evil"]}, "evil", "leads out"),
+            ({"extra": ["C:/evil"]}, "evil", "leads out"),
+        )
+    ),
+    ({"content": b"<html>", "content_type": "text/html; charset=utf-8"}, ["web page", *BY_HAND]),
+    ({"status": 404}, ["{url} answered 404", *BY_HAND]),
+    ({"url": "http://127.0.0.1:9/data.zip"}, ["{url} cannot be reached", *BY_HAND]),
+    ({"url": "file:///etc/hostname"}, ["{url} is not an http or https address", *BY_HAND]),
+]
 
 
-def test_damaged_archives_leave_no_scene(tmp_path, server):
-    whole = server.content
-    server.content = whole[:-100]
-    message = error(tmp_path, server)
-    assert "dnerf.zip" in message
-    assert "damaged" in message
-    assert list(tmp_path.iterdir()) == []
-
-    flipped = bytearray(whole)
-    name = b"trex/test/r_001.png"
-    flipped[whole.index(name, whole.index(b"data/" + name) + 10)] ^= 0xFF
-    server.content = bytes(flipped)
-    message = error(tmp_path, server)
-    assert "CRC" in message
-    assert "r_001.png" in message
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_members_that_leave_the_folder(tmp_path, server):
+@pytest.mark.parametrize(("changes", "words"), REFUSED, ids=[words[0] for _, words in REFUSED])
+def test_what_cannot_be_used_leaves_nothing_and_is_said(tmp_path, server, changes, words):
+    change(server, **changes)
     root = tmp_path / "root"
-    for name in ("../evil", "data/../../evil", "/evil", "data\\..\\evil", "C:/evil"):
-        server.content = make_archive(extra=[name])
-        message = error(root, server)
-        assert "evil" in message, name
-        assert "leads out" in message, name
-        assert list(root.iterdir()) == [], name
-        assert [path.name for path in tmp_path.iterdir()] == ["root"], name
-
-
-def test_incomplete_archive_leaves_no_scene(tmp_path, server):
-    for changes, words in (
-        ({"skip": ["trex/transforms_val.json"]}, "trex/transforms_val.json is missing"),
-        ({"skip": ["hook/test/r_000.png"]}, "hook lacks ./test/r_000.png"),
-        ({"train_views": {"lego": 1}}, "lego has 1 training views instead of 2"),
-    ):
-        server.content = make_archive(**changes)
-        assert words in error(tmp_path, server), changes
-        assert list(tmp_path.iterdir()) == [], changes
-
-
-def test_not_found_names_the_address_and_the_way_by_hand(tmp_path, server):
-    server.status = 404
-    message = error(tmp_path, server)
-    assert f"{server.url} answered 404" in message
-    assert DNERF_URL in message
-    assert str(tmp_path / "dnerf.zip") in message
-    assert "data=demo" in message
-    assert len(server.requests) == 1
-
-
-def test_web_page_instead_of_the_archive(tmp_path, server):
-    server.content = b"<html>This link was disabled</html>"
-    server.content_type = "text/html; charset=utf-8"
-    assert "web page" in error(tmp_path, server)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_addresses_that_cannot_be_reached(tmp_path, server):
-    server.url = "file:///etc/hostname"
-    assert "not an http or https address" in error(tmp_path, server)
-    server.url = "http://127.0.0.1:9/data.zip"
-    message = error(tmp_path, server)
-    assert "cannot be reached" in message
-    assert "by hand" in message
-    assert str(tmp_path / "dnerf.zip") in message
+    message = error(root, server)
+    for text in words:
+        assert text.format(url=server.url, root=root) in message
+    assert list(root.iterdir()) == []
+    assert list(tmp_path.iterdir()) == [root]
+    assert len(server.requests) == ("url" not in changes)
 
 
 def test_archive_fetched_by_hand_is_used_and_kept(tmp_path, server):
     (tmp_path / "dnerf.zip").write_bytes(server.content)
-    _, lines = download(tmp_path, server)
-    assert "already" in lines[0]
+    assert "already" in download(tmp_path, server)[0]
     assert not server.requests
-    assert sorted(scenes_in(tmp_path)) == sorted(VIEWS)
+    assert scenes_in(tmp_path) == sorted(VIEWS)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "dnerf.zip").write_bytes(b"no zip")
     assert "Replace it or delete it" in error(tmp_path / "other", server)
@@ -328,30 +286,15 @@ def test_archive_fetched_by_hand_is_used_and_kept(tmp_path, server):
 
 def test_full_disk(tmp_path, server, monkeypatch):
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 0, len(server.content)))
-    message = error(tmp_path, server)
-    assert "free space" in message
-    assert str(tmp_path) in message
-    assert scenes_in(tmp_path) == []
     # An archive fetched by hand has to be unpacked too.
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 0, 1000))
-    (tmp_path / "dnerf.zip").write_bytes(server.content)
-    assert "free space" in error(tmp_path, server)
-    assert scenes_in(tmp_path) == []
-
-
-def test_a_web_page_in_between_keeps_what_was_fetched(tmp_path, server, monkeypatch):
-    monkeypatch.setattr(fetch_module, "ATTEMPTS", 1)
-    server.limits = [50_000]
-    error(tmp_path, server)
-    content, server.content = server.content, b"<html>Busy</html>"
-    kind, server.content_type, server.ranges = server.content_type, "text/html", False
-    assert "web page" in error(tmp_path, server)
-    assert (tmp_path / "dnerf.zip.part").stat().st_size == 50_000
-    server.content, server.content_type, server.ranges = content, kind, True
-    download(tmp_path, server)
-    assert server.requests[-1]["Range"] == "bytes=50000-"
-    assert_complete(tmp_path)
+    for free, by_hand in ((len(server.content), False), (1000, True)):
+        monkeypatch.setattr(shutil, "disk_usage", lambda _, free=free: usage(10, 0, free))
+        if by_hand:
+            (tmp_path / "dnerf.zip").write_bytes(server.content)
+        message = error(tmp_path, server)
+        assert "free space" in message
+        assert str(tmp_path) in message
+        assert scenes_in(tmp_path) == []
 
 
 def test_a_disk_that_refuses_is_said_in_words(tmp_path, server, monkeypatch):
@@ -364,6 +307,6 @@ def test_a_disk_that_refuses_is_said_in_words(tmp_path, server, monkeypatch):
         if line.startswith("Downloading"):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(download_module, "say", full)
+    monkeypatch.setattr(module, "say", full)
     with pytest.raises(StorageError, match=r"cannot be written: No space left.*Free some space"):
         download_dnerf(tmp_path / "root", url=server.url)

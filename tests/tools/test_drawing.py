@@ -71,15 +71,14 @@ def grid_renderer(filled: ViewDependentField | None = None) -> GridRenderer:
     return GridRenderer(grid, 192)
 
 
-def views_of(
-    frame: Frame = FLAT, alpha: Tensor | None = None, times: Tensor | None = None
-) -> Views:
-    poses = orbit(4, radius=3 / frame.scale, elevation=10, target=frame.centre)
-    images = torch.zeros(4, SIZE, SIZE, 4, dtype=torch.uint8)
+def views_of(alpha: Tensor | None = None, times: Tensor | None = None) -> Views:
+    """Views from four places, at each time again."""
+    times = torch.zeros(4) if times is None else times
+    poses = orbit(4, radius=3, elevation=10, target=FLAT.centre).repeat(len(times) // 4, 1, 1)
+    images = torch.zeros(len(times), SIZE, SIZE, 4, dtype=torch.uint8)
     if alpha is not None:
         images[..., 3] = alpha
-    times = torch.zeros(4) if times is None else times
-    return Views(images, poses, times, 1.2 * SIZE, tuple("abcd"))  # type: ignore[arg-type]
+    return Views(images, poses, times, 1.2 * SIZE, tuple("abcdefgh"[: len(times)]))  # type: ignore[arg-type]
 
 
 def shot(**changed: Any) -> Shot:
@@ -201,45 +200,42 @@ def test_bounds_of_the_training_cameras_do_not_cut_the_scene_off():
     assert float((cut - expected.depth)[seen].abs().min()) > 0.3
 
 
+def silhouette(field: Balls, pose: Tensor) -> Tensor:
+    """The alpha of a view of `views_of` that shows a field. [SIZE, SIZE]"""
+    wanted = shot(pose=pose, aspect=1.0, fov=2 * math.atan(1 / 2.4))
+    return 255 * drawn(field, grid_renderer(), wanted).depth.isfinite()
+
+
+def redness(field: Balls, renderer: RayRenderer, views: Views, time: float = 0.0) -> Tensor:
+    """How much more red than green a picture of a field's floaters is. [SIZE, columns]"""
+    found = drawn(field, renderer, shot(mode="floaters", time=time), views).colours
+    return found[..., 0] - found[..., 1]
+
+
 @pytest.mark.parametrize("hidden", [False, True])
 def test_floaters_are_what_no_silhouette_covers(hidden):
     """A ball that the images show, and one that they do not, beside it or behind it."""
     there = Balls(FRONT)
     floater = BACK if hidden else torch.tensor([0.75, 0.5, 0.0])
     both = Balls(FRONT, floater)
-    alpha = []
-    for pose in views_of().camera_to_world:
-        seen = drawn(
-            there, grid_renderer(), shot(pose=pose, aspect=1.0, fov=2 * math.atan(1 / 2.4))
-        )
-        alpha.append(255 * seen.depth.isfinite())
+    alpha = [silhouette(there, pose) for pose in views_of().camera_to_world]
     # Views of other times show nothing, and are not looked at.
     views = views_of(alpha=torch.stack(alpha))
-    found = drawn(both, grid_renderer(both), shot(mode="floaters"), views)
-    red = found.colours[..., 0] - found.colours[..., 1] > 0.3
     expected = drawn(Balls(floater), grid_renderer(), shot()).depth.isfinite()
     assert expected.sum() > 40
-    assert (red == expected).float().mean() > 0.97
-    clean = drawn(there, grid_renderer(), shot(mode="floaters"), views).colours
-    assert float((clean[..., 0] - clean[..., 1]).abs().max()) < 1e-5
+    assert ((redness(both, grid_renderer(both), views) > 0.3) == expected).float().mean() > 0.97
+    assert float(redness(there, grid_renderer(), views).abs().max()) < 1e-5
 
 
 def test_floaters_are_told_by_the_images_nearest_in_time():
-    moved = torch.tensor([0.6, 0.0, 0.0])
-    alpha, times = [], torch.tensor([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
-    poses = views_of().camera_to_world.repeat(2, 1, 1)
-    for pose, time in zip(poses, times, strict=True):
-        ball = Balls(moved if time else FRONT)
-        seen = drawn(ball, grid_renderer(), shot(pose=pose, aspect=1.0, fov=2 * math.atan(1 / 2.4)))
-        alpha.append(255 * seen.depth.isfinite())
-    images = torch.zeros(8, SIZE, SIZE, 4, dtype=torch.uint8)
-    images[..., 3] = torch.stack(alpha)
-    views = Views(images, poses, times, 1.2 * SIZE, tuple("abcdefgh"))  # type: ignore[arg-type]
+    times = torch.tensor([0.0, 1.0]).repeat_interleave(4)
+    balls = {0.0: Balls(FRONT), 1.0: Balls(torch.tensor([0.6, 0.0, 0.0]))}
+    poses = views_of(times=times).camera_to_world
+    alpha = [silhouette(balls[t], pose) for t, pose in zip(times.tolist(), poses, strict=True)]
+    views = views_of(torch.stack(alpha), times)
     for time, floats in ((0.1, True), (0.9, False)):
-        found = drawn(
-            Balls(moved), grid_renderer(), shot(mode="floaters", time=time), views
-        ).colours
-        assert bool((found[..., 0] - found[..., 1] > 0.3).any()) == floats
+        red = redness(balls[1.0], grid_renderer(), views, time)
+        assert bool((red > 0.3).any()) == floats
 
 
 def test_drawing_ends_once_it_is_not_wanted():

@@ -112,8 +112,20 @@ def silhouettes(trained: TrainedRun, mesh: Any, time: float, pose: Tensor) -> tu
     return torch.stack(hit), image["opacity"] >= 0.5
 
 
-def agreement(first: Tensor, second: Tensor) -> float:
-    return float((first & second).sum() / (first | second).sum())
+def exported(trained: TrainedRun, what: str = "mesh", **options: Any) -> tuple[Any, Tensor]:
+    """What another program reads of an export, and its points in the field's frame. [N, 3]"""
+    wanted = ExportOptions(what, **{"times": "0.5", "resolution": 32, **options})
+    read = trimesh.load(export(trained, wanted) / f"{what}_0000.ply")
+    return read, trained.frame.points(torch.tensor(np.asarray(read.vertices)).float())
+
+
+def from_outside(points: Tensor, depth: float) -> tuple[np.ndarray, Tensor]:
+    """Colours that a `Ball` shows along normals from below its surface, and distances to it."""
+    outward = points - Ball.centre(0.5)
+    distance = outward.norm(dim=1, keepdim=True)
+    outward = outward / distance
+    colours = 0.5 + 0.2 * (points - depth * outward) + 0.2 * outward
+    return colours.numpy(), (distance - Ball.RADIUS).abs()
 
 
 @pytest.mark.parametrize("form", ["ply", "glb"])
@@ -155,37 +167,26 @@ def test_glb_files_are_matt_and_leave_the_world_to_a_node(tmp_path, what):
 
 def test_the_silhouette_of_a_mesh_is_that_of_the_field(tmp_path):
     trained = set_up(tmp_path, Ball(6.0, 0.05))
-    folder = export(trained, ExportOptions(times="0.5", resolution=32))
-    mesh = trimesh.load(folder / "mesh_0000.ply")
+    mesh, _ = exported(trained)
     pose = orbit(5, radius=7, elevation=-35, target=FRAME.centre)[2]
     covered, shown = silhouettes(trained, mesh, 0.5, pose)
     assert shown.sum() > 100
-    assert agreement(covered, shown) > 0.95
+    assert (covered & shown).sum() > 0.95 * (covered | shown).sum()
 
 
 def test_colours_of_vertices_are_those_that_the_field_shows_along_normals(tmp_path):
-    trained = set_up(tmp_path, Ball())
-    folder = export(trained, ExportOptions(times="0.5", resolution=32))
-    mesh = trimesh.load(folder / "mesh_0000.ply")
-    points = FRAME.points(torch.tensor(np.asarray(mesh.vertices)).float())
-    outward = points - Ball.centre(0.5)
-    outward = outward / outward.norm(dim=1, keepdim=True)
-    expected = (0.5 + 0.2 * (points - outward / 16) + 0.2 * outward).numpy()
+    mesh, points = exported(set_up(tmp_path, Ball()))
+    expected, _ = from_outside(points, 1 / 16)
     found = np.asarray(mesh.visual.vertex_colors)[:, :3] / 255
     assert np.abs(found - expected).max() < 0.05
     assert np.ptp(expected, axis=0).min() > 0.4
 
 
 def test_a_point_cloud_lies_on_the_surface(tmp_path):
-    trained = set_up(tmp_path, Ball())
-    options = ExportOptions(what="points", times="0.5", resolution=40, count=500)
-    cloud = trimesh.load(export(trained, options) / "points_0000.ply")
+    cloud, points = exported(set_up(tmp_path, Ball()), "points", resolution=40, count=500)
     assert cloud.vertices.shape == (500, 3)
-    points = FRAME.points(torch.tensor(np.asarray(cloud.vertices)).float())
-    outward = points - Ball.centre(0.5)
-    assert float((outward.norm(dim=1) - Ball.RADIUS).abs().max()) < 0.07
-    outward = outward / outward.norm(dim=1, keepdim=True)
-    expected = (0.5 + 0.2 * (points - outward / 20) + 0.2 * outward).numpy()
+    expected, away = from_outside(points, 1 / 20)
+    assert float(away.max()) < 0.07
     assert np.abs(cloud.colors[:, :3] / 255 - expected).max() < 0.08
 
 
@@ -227,9 +228,7 @@ def test_the_threshold_is_the_density_of_the_surface(tmp_path, name):
     trained, resolution = dense(tmp_path, name), 48
     volume, _ = module.solidity(trained, 0.5, resolution)
     threshold = float(-torch.log1p(-volume[volume > 0]).median()) * resolution / 2
-    options = ExportOptions(times="0.5", resolution=resolution, threshold=threshold)
-    mesh = trimesh.load(export(trained, options) / "mesh_0000.ply")
-    points = torch.tensor(np.asarray(mesh.vertices)).float()
+    _, points = exported(trained, resolution=resolution, threshold=threshold)
     low, high = BOX if name == "TiNeuVox" else torch.tensor([[-1.0] * 3, [1.0] * 3])
     points = points[((points > low + 0.05) & (points < high - 0.05)).all(dim=1)]
     assert len(points) > 100
@@ -243,9 +242,7 @@ def test_a_field_of_signed_distances_gives_its_own_surface(tmp_path):
     field = tensor4d(width=64, filled=False)
     renderer = NeusRenderer(field, samples=8, more=8, coarse_sharpness=64.0)
     trained = set_up(tmp_path, field, renderer)
-    folder = export(trained, ExportOptions(times="0.0", resolution=32))
-    mesh = trimesh.load(folder / "mesh_0000.ply")
-    points = FRAME.points(torch.tensor(np.asarray(mesh.vertices)).float())
+    _, points = exported(trained, times="0.0")
     with torch.no_grad():
         distance = field.distance(field.canonical(points, torch.zeros(len(points))))[0]
     assert float(distance.abs().max()) < 0.03
@@ -316,11 +313,9 @@ def test_the_training_cameras_are_a_path_that_is_rendered_again(trained_run, tmp
     trained = load_run(trained_run)
     views = trained.scene.splits["train"]
     order = views.times.argsort(stable=True)
-    assert json.loads((out / "export.json").read_text())["files"] == [
-        "camera_path.json",
-        "transforms.json",
-    ]
-    for name in ("camera_path.json", "transforms.json"):
+    names = ["camera_path.json", "transforms.json"]
+    assert json.loads((out / "export.json").read_text())["files"] == names
+    for name in names:
         path = read_camera_path(out / name)
         assert torch.equal(path.poses, views.camera_to_world[order])
         assert torch.equal(path.times, views.times[order])
@@ -330,14 +325,9 @@ def test_the_training_cameras_are_a_path_that_is_rendered_again(trained_run, tmp
         arguments = ["--path", str(out / name), "--out", f"{tmp_path}/{name}/"]
         assert main(["render", str(trained_run), *arguments]) == 0
         for number in (0, len(views) - 1):
-            expected = score_view(
-                trained.module.field,
-                trained.module.renderer,
-                trained.frame,
-                views,
-                int(order[number]),
-                trained.scene.background,
-            )[1]
+            parts = (trained.module.field, trained.module.renderer, trained.frame)
+            index, white = int(order[number]), trained.scene.background
+            expected = score_view(*parts, views, index, white)[1]
             with Image.open(tmp_path / name / f"frame_{number:04d}.png") as frame:
                 found = torch.tensor(np.asarray(frame)).int()
             assert (found - to_bytes(expected["colour"]).int()).abs().max() <= 1
@@ -362,25 +352,29 @@ def test_times():
     assert export_times("1") == [0]
     assert export_times("0.5") == [0.5]
     assert export_times("0,0.25, 1") == [0, 0.25, 1]
-    for text in ("0", "", "soon", "0,2", "nan,", "-0.5"):
-        with pytest.raises(ConfigError, match=f"--times {text}"):
-            export_times(text)
 
 
-def test_bad_options_are_refused(tmp_path):
-    for options, words in {
-        ExportOptions(form="obj"): "--format obj",
-        ExportOptions(resolution=4): "--resolution 4: must lie between 8 and",
-        ExportOptions(count=0): "--points 0",
-        ExportOptions(threshold=-1.0): "--threshold -1",
-        ExportOptions(threshold=float("nan")): "--threshold nan",
-        ExportOptions(times="2.5"): "--times 2.5",
-        ExportOptions(what="gaussians", form="glb"): "--format glb: --what gaussians does not use",
-        ExportOptions(what="path", times="3"): "--times 3: --what path does not use",
-        ExportOptions(what="mesh", count=9): "--points 9: --what mesh does not use",
-    }.items():
-        with pytest.raises(ConfigError, match=words):
-            options.check()
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"form": "obj"}, "--format obj"),
+        ({"resolution": 4}, "--resolution 4: must lie between 8 and"),
+        ({"count": 0}, "--points 0"),
+        ({"threshold": -1.0}, "--threshold -1"),
+        ({"threshold": float("nan")}, "--threshold nan"),
+        ({"times": "2.5"}, "--times 2.5"),
+        *(
+            ({"times": text}, f"--times {text}")
+            for text in ("0", "", "soon", "0,2", "nan,", "-0.5")
+        ),
+        ({"what": "gaussians", "form": "glb"}, "--format glb: --what gaussians does not use"),
+        ({"what": "path", "times": "3"}, "--times 3: --what path does not use"),
+        ({"what": "mesh", "count": 9}, "--points 9: --what mesh does not use"),
+    ],
+)
+def test_bad_options_are_refused(options, words):
+    with pytest.raises(ConfigError, match=words):
+        ExportOptions(**options).check()
 
 
 def test_exports_that_cannot_be_are_refused(tmp_path):

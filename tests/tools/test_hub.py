@@ -32,7 +32,10 @@ class Hub(http.server.BaseHTTPRequestHandler):
     requests: list[tuple[str, str, str | None]]
     name: str | None
 
-    def _answer(self, body: bytes, status: int = 200, **headers: str) -> None:
+    def _answer(self, body: Any, status: int = 200, **headers: str) -> None:
+        if not isinstance(body, bytes):
+            body = json.dumps(body).encode()
+            headers["Content_Type"] = "application/json"
         self.send_response(status)
         for name, value in {"Content-Length": str(len(body)), **headers}.items():
             self.send_header(name.replace("_", "-"), value)
@@ -40,38 +43,31 @@ class Hub(http.server.BaseHTTPRequestHandler):
         if self.command != "HEAD":
             self.wfile.write(body)
 
-    def _json(self, content: Any, status: int = 200, **headers: str) -> None:
-        self._answer(
-            json.dumps(content).encode(), status, Content_Type="application/json", **headers
-        )
-
     def _missing(self) -> None:
-        self._json({"error": "not found"}, 404, X_Error_Code="RepoNotFound")
+        self._answer({"error": "not found"}, 404, X_Error_Code="RepoNotFound")
 
     def do_POST(self) -> None:
         hub, body = type(self), self.rfile.read(int(self.headers["Content-Length"]))
         hub.requests.append(("POST", self.path, self.headers.get("Authorization")))
         path = self.path.partition("?")[0]
         if self.headers.get("Authorization") != "Bearer hf_of_a_test":
-            self._json({"error": "unauthorized"}, 401)
+            self._answer({"error": "unauthorized"}, 401)
         elif path == "/api/repos/create":
             asked = json.loads(body)
             hub.name = f"{asked.get('organization', 'somebody')}/{asked['name']}"
-            self._json({"url": f"http://{self.headers['Host']}/{hub.name}"})
+            self._answer({"url": f"http://{self.headers['Host']}/{hub.name}"})
         elif path == "/api/validate-yaml":
-            self._json({"errors": [], "warnings": []})
+            self._answer({"errors": [], "warnings": []})
         elif path.endswith("/preupload/main"):
-            files = [
-                {"path": each["path"], "uploadMode": "regular", "shouldIgnore": False}
-                for each in json.loads(body)["files"]
-            ]
-            self._json({"files": files})
+            asked = [each["path"] for each in json.loads(body)["files"]]
+            regular = {"uploadMode": "regular", "shouldIgnore": False}
+            self._answer({"files": [{"path": name, **regular} for name in asked]})
         elif path.endswith("/commit/main"):
             for line in map(json.loads, body.splitlines()):
                 if line["key"] == "file":
                     hub.files[line["value"]["path"]] = base64.b64decode(line["value"]["content"])
             address = f"http://{self.headers['Host']}/{hub.name}/commit/{COMMIT}"
-            self._json({"commitUrl": address, "commitOid": COMMIT, "success": True})
+            self._answer({"commitUrl": address, "commitOid": COMMIT, "success": True})
         else:
             self._missing()
 
@@ -86,18 +82,17 @@ class Hub(http.server.BaseHTTPRequestHandler):
                 {"type": "file", "path": name, "size": len(content), "oid": oid(content)}
                 for name, content in hub.files.items()
             ]
-            self._json(tree)
+            self._answer(tree)
         elif path.startswith(f"/api/models/{hub.name}"):
             siblings = [{"rfilename": name} for name in hub.files]
-            self._json({"id": hub.name, "sha": COMMIT, "siblings": siblings})
+            self._answer({"id": hub.name, "sha": COMMIT, "siblings": siblings})
         elif (found := re.fullmatch(rf"/{hub.name}/resolve/{COMMIT}/(.+)", path)) is not None:
             content = hub.files[found[1]]
             self._answer(content, ETag=f'"{oid(content)}"', X_Repo_Commit=COMMIT)
         else:
             self._missing()
 
-    def do_HEAD(self) -> None:
-        self.do_GET()
+    do_HEAD = do_GET  # noqa: N815
 
     def log_message(self, *_: Any) -> None:
         pass
@@ -176,21 +171,19 @@ def test_the_model_card_has_scores_command_and_licence(trained_run, tmp_path):
     assert "hf://somebody/excavator" in text
     assert "random initialisation" in text
 
-    run = tmp_path / "run"
-    shutil.copytree(trained_run, run)
+    run = Path(shutil.copytree(trained_run, tmp_path / "run"))
     config = yaml.safe_load((run / "config.yaml").read_text())
-    config["lrm"] = {"name": "base", "repository": "somebody/lrm", "licence": "CC-BY-NC-4.0"}
-    (run / "config.yaml").write_text(yaml.safe_dump(config))
-    head, text = card_of(run)
+
+    def card_with(**lrm: str) -> tuple[dict[str, Any], str]:
+        (run / "config.yaml").write_text(yaml.safe_dump(config | {"lrm": lrm}))
+        return card_of(run)
+
+    head, text = card_with(name="base", repository="somebody/lrm", licence="CC-BY-NC-4.0")
     assert (head["license"], head["base_model"]) == ("cc-by-nc-4.0", "somebody/lrm")
     assert "licence CC-BY-NC-4.0" in text
-    config["lrm"] = {"name": "tiny", "bundled": "tiny"}
-    (run / "config.yaml").write_text(yaml.safe_dump(config))
-    assert "bundled with X-Planes (MIT licence)" in card_of(run)[1]
-    config["lrm"]["name"] = "auto"
-    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    assert "bundled with X-Planes (MIT licence)" in card_with(name="tiny", bundled="tiny")[1]
     assert metrics["lrm"] == {}
-    assert "random initialisation" in card_of(run)[1]
+    assert "random initialisation" in card_with(name="auto", bundled="tiny")[1]
 
 
 def test_commands_read_a_run_of_the_hub(hub, trained_run, tmp_path, monkeypatch, capsys):

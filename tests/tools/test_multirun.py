@@ -4,7 +4,9 @@ import csv
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import pytest
 from hydra.types import RunMode
 
 from tests.inside import train
@@ -35,21 +37,22 @@ def test_a_failed_job_is_a_row_and_the_others_go_on(scenes, tmp_path):
     assert "job 1 finished: psnr" in done.stdout
 
 
-def settings(folder: Path) -> SimpleNamespace:
-    return SimpleNamespace(
-        hydra=SimpleNamespace(
-            mode=RunMode.MULTIRUN,
-            job=SimpleNamespace(num=3),
-            runtime=SimpleNamespace(output_dir=str(folder)),
-            sweep=SimpleNamespace(dir=str(folder)),
-        )
+def swept(folder: Path, **options: Any) -> SweepTable:
+    """The callback of a sweep whose jobs are done."""
+    hydra = SimpleNamespace(
+        mode=RunMode.MULTIRUN,
+        job=SimpleNamespace(num=3),
+        runtime=SimpleNamespace(output_dir=str(folder)),
+        sweep=SimpleNamespace(dir=str(folder)),
     )
+    callback, settings = SweepTable(**options), SimpleNamespace(hydra=hydra)
+    callback.on_multirun_start(settings)  # type: ignore[arg-type]
+    callback.on_multirun_end(settings)  # type: ignore[arg-type]
+    return callback
 
 
 def test_a_sweep_without_jobs_leaves_no_table(tmp_path, capsys):
-    callback = SweepTable()
-    callback.on_multirun_start(settings(tmp_path))  # type: ignore[arg-type]
-    callback.on_multirun_end(settings(tmp_path))  # type: ignore[arg-type]
+    swept(tmp_path)
     assert capsys.readouterr().out == ""
     assert list(tmp_path.iterdir()) == []
 
@@ -57,27 +60,24 @@ def test_a_sweep_without_jobs_leaves_no_table(tmp_path, capsys):
 def test_the_table_comes_once(tmp_path, capsys):
     (tmp_path / "0").mkdir()
     (tmp_path / "0" / "run.json").write_text(json.dumps({"status": "failed", "reason": "x"}))
-    callback = SweepTable()
-    callback.on_multirun_start(settings(tmp_path))  # type: ignore[arg-type]
-    callback.on_multirun_end(settings(tmp_path))  # type: ignore[arg-type]
-    callback._finish()
+    swept(tmp_path)._finish()
     assert capsys.readouterr().out.count("failed: x") == 1
 
 
 def test_a_sheet_of_any_kind_has_the_name_that_pages_link_to(tmp_path, capsys):
     pictured(tmp_path / "0")
-    callback = SweepTable(sheet="steps")
-    callback.on_multirun_start(settings(tmp_path))  # type: ignore[arg-type]
-    callback.on_multirun_end(settings(tmp_path))  # type: ignore[arg-type]
+    swept(tmp_path, sheet="steps")
     assert f"wrote {tmp_path / 'sheet.png'}\n" in capsys.readouterr().out
     assert len(areas(tmp_path / "sheet.png")) == 3  # The truth and two steps.
 
 
-def test_jobs_take_the_gpus_in_turn():
-    cases = [("0,1", 0, "0"), ("0,1", 3, "1"), ("4, 6,7", 4, "6"), ("5", 3, None), ("", 1, None)]
-    for visible, job, gpu in cases:
-        environment = {"CUDA_VISIBLE_DEVICES": visible}
-        assert choose_gpu(job, environment) == gpu, (visible, job)
-        assert environment["CUDA_VISIBLE_DEVICES"] == (gpu or visible), (visible, job)
-        # The next job of the same process stays there.
-        assert choose_gpu(job + 1, environment) is None, (visible, job)
+@pytest.mark.parametrize(
+    ("visible", "job", "gpu"),
+    [("0,1", 0, "0"), ("0,1", 3, "1"), ("4, 6,7", 4, "6"), ("5", 3, None), ("", 1, None)],
+)
+def test_jobs_take_the_gpus_in_turn(visible, job, gpu):
+    environment = {"CUDA_VISIBLE_DEVICES": visible}
+    assert choose_gpu(job, environment) == gpu
+    assert environment["CUDA_VISIBLE_DEVICES"] == (gpu or visible)
+    # The next job of the same process stays there.
+    assert choose_gpu(job + 1, environment) is None

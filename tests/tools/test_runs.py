@@ -2,12 +2,15 @@
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 import yaml
 
+from tests.refusals import assert_refused
 from xplanes.errors import ConfigError
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.tools.runs import find_run, load_run
@@ -18,21 +21,19 @@ def copied(trained_run: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(trained_run, tmp_path / "run"))
 
 
-def make(folder: Path) -> Path:
-    folder.mkdir(parents=True)
-    (folder / "run.json").write_text("{}")
-    return folder
+def made(*folders: Path) -> None:
+    for folder in folders:
+        folder.mkdir(parents=True)
+        (folder / "run.json").write_text("{}")
 
 
 def refusal(run: Path, outputs: Path) -> str:
-    with pytest.raises(ConfigError) as error:
-        find_run(run, outputs)
-    return str(error.value)
+    return assert_refused(ConfigError, "", partial(find_run, run, outputs), run)
 
 
 def test_a_misspelt_run_lists_similar_names(tmp_path):
-    near = make(tmp_path / "outputs" / "2026-01-02_lego_six_planes_s0")
-    make(tmp_path / "outputs" / "zzz")
+    near = tmp_path / "outputs" / "2026-01-02_lego_six_planes_s0"
+    made(near, tmp_path / "outputs" / "zzz")
     text = refusal(tmp_path / "outputs" / "2026-01-02_lego_six_plane_s0", tmp_path / "outputs")
     assert "does not exist. Similar names:" in text
     assert str(near) in text
@@ -40,15 +41,14 @@ def test_a_misspelt_run_lists_similar_names(tmp_path):
 
 
 def test_an_unknown_run_lists_the_newest(tmp_path):
-    run = make(tmp_path / "outputs" / "sweeps" / "planes" / "0_lego")
+    made(run := tmp_path / "outputs" / "sweeps" / "planes" / "0_lego")
     text = refusal(Path("qqq"), tmp_path / "outputs")
     assert "The newest runs:" in text
     assert str(run) in text
 
 
 def test_a_sweep_is_told_from_a_run(tmp_path):
-    make(tmp_path / "sweep" / "0_a")
-    make(tmp_path / "sweep" / "1_b")
+    made(tmp_path / "sweep" / "0_a", tmp_path / "sweep" / "1_b")
     text = refusal(tmp_path / "sweep", tmp_path)
     assert "folder of 2 runs; name one of them" in text
     assert "0_a" in text
@@ -67,37 +67,42 @@ def test_what_is_loaded_is_announced_first(trained_run):
     assert not trained.module.training
 
 
-def test_damaged_files_are_named(copied):
-    cases = [
+def changed(run: Path, name: str, **changes: Any) -> dict[str, Any]:
+    """What a file of a run held before these changes."""
+    before = yaml.safe_load((run / name).read_text())
+    (run / name).write_text(json.dumps(before | changes) + "\n")
+    return before
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "words"),
+    [
         ("config.yaml", "a: [", "damaged"),
         ("config.yaml", "seed: 0\n", "damaged, or from another version"),
         ("config.yaml", "text\n", "not a mapping"),
         ("checkpoints/last.ckpt", "text", "cannot be read"),
         ("checkpoints/last.ckpt", {"weights": torch.zeros(3)}, "not a checkpoint of xplanes"),
-    ]
-    for file, content, words in cases:
-        whole = (copied / file).read_bytes()
-        if isinstance(content, str):
-            (copied / file).write_text(content)
-        else:
-            torch.save(content, copied / file)
-        with pytest.raises(ConfigError, match=words) as error:
-            load_run(copied)
-        assert str(copied / file) in str(error.value), content
-        (copied / file).write_bytes(whole)
-    (copied / "checkpoints" / "last.ckpt").unlink()
-    with pytest.raises(ConfigError, match="before its first checkpoint"):
+        ("checkpoints/last.ckpt", None, "before its first checkpoint"),
+    ],
+)
+def test_damaged_files_are_named(copied, file, content, words):
+    path = copied / file
+    path.unlink()
+    if isinstance(content, str):
+        path.write_text(content)
+    elif content is not None:
+        torch.save(content, path)
+    said = assert_refused(ConfigError, words, partial(load_run, copied), words)
+    assert content is None or str(path) in said
+
+
+@pytest.mark.parametrize("change", [{"channels": 16}, {"name": "nine", "plane_set": "nine"}])
+def test_another_model_than_the_checkpoints_is_refused(copied, change):
+    model = changed(copied, "config.yaml")["model"]
+    assert model["channels"] == 8
+    changed(copied, "config.yaml", model=model | change)
+    with pytest.raises(ConfigError, match="does not fit"):
         load_run(copied)
-
-
-def test_another_model_than_the_checkpoints_is_refused(copied):
-    config = yaml.safe_load((copied / "config.yaml").read_text())
-    model = config["model"]
-    for change in ({"channels": 2 * model["channels"]}, {"name": "nine", "plane_set": "nine"}):
-        changed = config | {"model": model | change}
-        (copied / "config.yaml").write_text(yaml.safe_dump(changed))
-        with pytest.raises(ConfigError, match="does not fit"):
-            load_run(copied)
 
 
 def test_the_data_of_a_run_is_that_which_it_was_trained_on(trained_run):
@@ -109,20 +114,17 @@ def test_the_data_of_a_run_is_that_which_it_was_trained_on(trained_run):
 
 
 def test_other_training_views_are_refused(copied):
-    record = json.loads((copied / "run.json").read_text())
-    record["files"]["train"] = record["files"]["train"][:-1]
-    (copied / "run.json").write_text(json.dumps(record))
+    files = changed(copied, "run.json")["files"]
+    changed(copied, "run.json", files=files | {"train": files["train"][:-1]})
     with pytest.raises(ConfigError, match="trained on 9 views"):
         load_run(copied)
 
 
 def test_a_relative_data_folder_is_found_from_elsewhere(copied, monkeypatch, tmp_path):
-    config = yaml.safe_load((copied / "config.yaml").read_text())
-    root = Path(config["data"]["root"])
-    config["data"]["root"] = root.name
-    (copied / "config.yaml").write_text(yaml.safe_dump(config))
-    record = json.loads((copied / "run.json").read_text())
-    (copied / "run.json").write_text(json.dumps(record | {"directory": str(root.parent)}))
+    data = changed(copied, "config.yaml")["data"]
+    root = Path(data["root"])
+    changed(copied, "config.yaml", data=data | {"root": root.name})
+    changed(copied, "run.json", directory=str(root.parent))
     monkeypatch.chdir(tmp_path)
     assert load_run(copied).experiment.data.root == str(root)
     assert not (tmp_path / root.name).exists()

@@ -1,5 +1,6 @@
 """The viewer: camera conventions, what browsers are sent and when, and a field that trains."""
 
+import itertools
 import math
 import socket
 import sys
@@ -17,6 +18,7 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
 from tests.baselines.runs import KPLANES, PROPOSAL, baseline_config
+from tests.captures import quaternion
 from tests.training.runs import small_config, train_quietly
 from tests.training.test_surroundings import scene
 from xplanes import RadianceModule
@@ -47,19 +49,9 @@ def viewer(trained: TrainedRun) -> Iterator[Viewer]:
     found.close()
 
 
-def quaternion(pose: Tensor) -> Tensor:
-    """The viser rotation of one of our cameras, wxyz: an eigenvector of Bar-Itzhack's matrix."""
-    r = pose[:3, :3].double() * torch.tensor([1.0, -1.0, -1.0])
-    k = torch.tensor(
-        [
-            [r[0, 0] + r[1, 1] + r[2, 2], 0, 0, 0],
-            [r[2, 1] - r[1, 2], r[0, 0] - r[1, 1] - r[2, 2], 0, 0],
-            [r[0, 2] - r[2, 0], r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], 0],
-            [r[1, 0] - r[0, 1], r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1]],
-        ],
-        dtype=torch.float64,
-    )
-    return torch.linalg.eigh(k)[1][:, -1]
+def rotation(pose: Tensor) -> np.ndarray:
+    """The viser rotation of one of our cameras, wxyz."""
+    return quaternion((pose[:3, :3].double() * torch.tensor([1.0, -1.0, -1.0])).numpy())
 
 
 class Client:
@@ -71,7 +63,7 @@ class Client:
         self.depths: list[np.ndarray | None] = []
         self.moved: list[Callable[[Any], None]] = []
         self.camera = SimpleNamespace(
-            wxyz=quaternion(pose).numpy(),
+            wxyz=rotation(pose),
             position=pose[:3, 3].double().numpy(),
             fov=0.7,
             aspect=1.5,
@@ -96,25 +88,27 @@ class Client:
         return [len(image) for image in self.shown]
 
 
-def first_pose(trained: TrainedRun) -> Tensor:
-    """A training camera in the field's frame."""
+@pytest.fixture
+def client(trained: TrainedRun, viewer: Viewer) -> Client:
+    """A browser at a training camera."""
     pose = trained.scene.splits["train"].camera_to_world[0].clone()
     pose[:3, :3] = trained.frame.rotation @ pose[:3, :3]
     pose[:3, 3] = trained.frame.points(pose[:3, 3])
-    return pose
-
-
-@pytest.fixture
-def client(trained: TrainedRun, viewer: Viewer) -> Client:
-    found = Client(first_pose(trained))
+    found = Client(pose)
     viewer.size.value = "64"
     viewer._connect(found)
     return found
 
 
+def rest(viewer: Viewer) -> None:
+    """Nothing changes until a full picture is due."""
+    time.sleep(module.SETTLE_SECONDS + 0.01)
+    viewer.catch_up()
+
+
 def test_cameras_come_back_as_ours(trained):
     for pose in orbit_poses(trained.views, trained.frame, 5, elevation=35):
-        back = camera_pose(quaternion(pose), pose[:3, 3])
+        back = camera_pose(torch.tensor(rotation(pose)), pose[:3, 3])
         assert torch.allclose(back, pose, atol=1e-5)
 
 
@@ -126,8 +120,7 @@ def test_pictures_are_small_while_something_changes_and_full_at_rest(viewer, cli
         viewer.catch_up()
         assert client.rows[before:] == [module.FEWEST]
         assert client.shown[-1].shape == (16, 24, 3)
-        time.sleep(module.SETTLE_SECONDS + 0.01)
-        viewer.catch_up()
+        rest(viewer)
         assert client.rows[before:] == [module.FEWEST, 64]
         assert client.shown[-1].shape == (64, 96, 3)
         viewer.catch_up()
@@ -137,7 +130,6 @@ def test_pictures_are_small_while_something_changes_and_full_at_rest(viewer, cli
 def test_a_full_picture_is_given_up_when_the_camera_moves(viewer, client, monkeypatch):
     monkeypatch.setattr(module, "MOVING_SECONDS", 0.0)
     viewer.catch_up()
-    time.sleep(module.SETTLE_SECONDS + 0.01)
     draw, begun = module.draw, []
 
     def moving(*parts: Any, **options: Any) -> Any:
@@ -147,7 +139,7 @@ def test_a_full_picture_is_given_up_when_the_camera_moves(viewer, client, monkey
         return draw(*parts, **options)
 
     monkeypatch.setattr(module, "draw", moving)
-    viewer.catch_up()
+    rest(viewer)
     assert len(begun) == 2  # The full one was begun.
     assert client.rows == [module.FEWEST] * 2
 
@@ -155,8 +147,7 @@ def test_a_full_picture_is_given_up_when_the_camera_moves(viewer, client, monkey
 def test_controls_change_the_picture(viewer, client):
     def picture() -> np.ndarray:
         viewer.catch_up()
-        time.sleep(module.SETTLE_SECONDS + 0.01)
-        viewer.catch_up()
+        rest(viewer)
         return client.shown[-1].astype(int)
 
     shown = {"colour": picture()}
@@ -169,10 +160,8 @@ def test_controls_change_the_picture(viewer, client):
     assert viewer.outline.visible
     assert viewer.outline.scale == (1, 2, 2)
     assert viewer.outline.position.tolist() == [-0.5, 0, 0]
-    for name, image in shown.items():
-        assert all(
-            np.abs(image - other).mean() > 1 for key, other in shown.items() if key != name
-        ), name
+    for first, second in itertools.combinations(shown, 2):
+        assert np.abs(shown[first] - shown[second]).mean() > 1, (first, second)
     viewer._uncrop()
     assert np.array_equal(picture(), shown["colour"])
     assert not viewer.outline.visible

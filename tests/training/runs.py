@@ -46,6 +46,9 @@ SMALL = (
     "media=false",
 )
 
+UNSCORED = "callbacks.evaluation.at=[]"
+"""Training alone is looked at."""
+
 
 @functools.cache
 def composed(*overrides: str) -> DictConfig:

@@ -3,14 +3,15 @@
 import signal
 import weakref
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tests.training.runs import (
+    UNSCORED,
     after_each_batch,
     broken_off,
     checkpoint,
@@ -35,6 +36,11 @@ def curve(folder: Path) -> list[dict[str, str]]:
     return read_rows(folder / "curve.csv")
 
 
+def steps(folder: Path) -> list[str]:
+    """The steps of a run's evaluations."""
+    return [row["step"] for row in curve(folder)]
+
+
 def exact(folder: Path) -> dict:
     """The numbers that must not depend on the clock."""
     content = metrics(folder)
@@ -42,18 +48,11 @@ def exact(folder: Path) -> dict:
     return {name: content[name] for name in kept}
 
 
-@dataclass
-class Watched:
-    """A run whose doings were noted."""
-
-    folder: Path
-    pictures: list[weakref.ref] = field(default_factory=list)
-    saved: list[tuple[int, str]] = field(default_factory=list)
-
-
 @pytest.fixture(scope="module")
-def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Watched:
-    notes = Watched(tmp_path_factory.mktemp("runs") / "watched")
+def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """A run whose pictures and checkpoints were noted."""
+    folder = tmp_path_factory.mktemp("runs") / "watched"
+    notes = SimpleNamespace(folder=folder, pictures=[], saved=[])
     score = RadianceModule.validation_step
     save = AtomicCheckpointIO.save_checkpoint
 
@@ -70,7 +69,7 @@ def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Watched:
         patch.setattr(RadianceModule, "validation_step", note_picture)
         patch.setattr(evaluation, "SHOWN", 2)
         patch.setattr(AtomicCheckpointIO, "save_checkpoint", note_checkpoint)
-        run(small_config(scenes), notes.folder, [], resume=False)
+        run(small_config(scenes), folder, [], resume=False)
     return notes
 
 
@@ -106,9 +105,8 @@ def same(folder: Path, whole: Path) -> None:
     """Two runs have the same numbers; the seconds of their curves are the clock's."""
     assert status(folder)["status"] == "finished"
     assert exact(folder) == exact(whole)
-    assert [(r["step"], r["psnr"]) for r in curve(folder)] == [
-        (r["step"], r["psnr"]) for r in curve(whole)
-    ]
+    ours, theirs = ([(row["step"], row["psnr"]) for row in curve(run)] for run in (folder, whole))
+    assert ours == theirs
 
 
 def test_a_run_resumed_after_failures_equals_an_uninterrupted_one(
@@ -151,7 +149,13 @@ def interrupt_where(
     after_each_batch(monkeypatch, press_ctrl_c)
 
 
-def test_a_second_interrupt_saves_no_half_of_a_step(scenes, tmp_path, monkeypatch):
+def stopped_at(folder: Path) -> tuple[int, int]:
+    """Steps and batches that the last checkpoint of a run has done."""
+    state = checkpoint(folder)
+    return state["global_step"], state["progress"]["batches"]
+
+
+def test_a_second_interrupt_saves_no_half_of_a_step(train, tmp_path, monkeypatch):
     original = RadianceModule.on_after_backward
 
     def press_twice(self) -> None:
@@ -161,47 +165,43 @@ def test_a_second_interrupt_saves_no_half_of_a_step(scenes, tmp_path, monkeypatc
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(RadianceModule, "on_after_backward", press_twice)
-    folder = tmp_path / "stopped"
     with pytest.raises(KeyboardInterrupt):
-        run(small_config(scenes, "callbacks.evaluation.at=[]"), folder, [], resume=False)
-    state = checkpoint(folder)
-    assert (state["global_step"], state["progress"]["batches"]) == (10, 10)
+        train(UNSCORED)
+    assert stopped_at(tmp_path / "run") == (10, 10)
 
 
-def test_an_interrupt_waits_for_the_update_of_its_batches(scenes, tmp_path, monkeypatch):
+def test_an_interrupt_waits_for_the_update_of_its_batches(train, tmp_path, monkeypatch):
     interrupt_where(lambda module: module.batches == 7, monkeypatch)
-    folder = tmp_path / "stopped"
-    config = small_config(scenes, "trainer.accumulate_grad_batches=3", "callbacks.evaluation.at=[]")
     with pytest.raises(KeyboardInterrupt):
-        run(config, folder, [], resume=False)
-    state = checkpoint(folder)
-    assert (state["global_step"], state["progress"]["batches"]) == (3, 9)
+        train(UNSCORED, "trainer.accumulate_grad_batches=3")
+    assert stopped_at(tmp_path / "run") == (3, 9)
+
+
+def handlers() -> list:
+    return [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
 
 
 def test_interrupt_saves_the_step_it_stopped_at_and_its_evaluation_is_done_again(
-    trained_run, scenes, tmp_path, monkeypatch
+    trained_run, train, tmp_path, monkeypatch
 ):
     # The evaluation at step 20 is due then.
     interrupt_where(lambda module: module.global_step == 20, monkeypatch)
-    folder = tmp_path / "stopped"
-    config = small_config(scenes, "callbacks.checkpoints.every=1000")
-    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    before, folder = handlers(), tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        run(config, folder, [], resume=False)
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+        train("callbacks.checkpoints.every=1000")
+    assert handlers() == before
     assert status(folder)["status"] == "interrupted"
-    state = checkpoint(folder)
-    assert state["global_step"] == 20
-    assert [row["step"] for row in curve(folder)] == ["0"]
+    assert stopped_at(folder)[0] == 20
+    assert steps(folder) == ["0"]
     monkeypatch.undo()
-    run(config, folder, [], resume=True)
-    assert [row["step"] for row in curve(folder)] == ["0", "21", "40"]
+    train("callbacks.checkpoints.every=1000", resume=True)
+    assert steps(folder) == ["0", "21", "40"]
     assert exact(folder) == exact(trained_run)
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+    assert handlers() == before
 
 
 def test_a_final_evaluation_that_was_interrupted_is_made_up_for(
-    trained_run, scenes, tmp_path, monkeypatch
+    trained_run, train, tmp_path, monkeypatch
 ):
     """Though not a step is left to train."""
     original = Evaluation.on_validation_start
@@ -212,12 +212,11 @@ def test_a_final_evaluation_that_was_interrupted_is_made_up_for(
         original(self, trainer, *rest)
 
     monkeypatch.setattr(Evaluation, "on_validation_start", press)
-    folder = tmp_path / "stopped"
     with pytest.raises(KeyboardInterrupt):
-        run(small_config(scenes), folder, [], resume=False)
-    assert [row["step"] for row in curve(folder)] == ["0", "20"]
+        train()
+    assert steps(tmp_path / "run") == ["0", "20"]
     monkeypatch.undo()
-    run(small_config(scenes), folder, [], resume=True)
+    folder = train(resume=True)
     same(folder, trained_run)
     for name in ("last", "best"):
         ours, theirs = (checkpoint(place, name) for place in (folder, trained_run))
@@ -225,7 +224,7 @@ def test_a_final_evaluation_that_was_interrupted_is_made_up_for(
         same_state(ours["state_dict"], theirs["state_dict"])
 
 
-def test_an_evaluation_waits_for_the_update_of_its_batches(scenes, tmp_path, monkeypatch):
+def test_an_evaluation_waits_for_the_update_of_its_batches(train, monkeypatch):
     """It may stop where it is, and the best checkpoint holds no gradients."""
     start = Evaluation.on_validation_start
     batches = []
@@ -239,14 +238,8 @@ def test_an_evaluation_waits_for_the_update_of_its_batches(scenes, tmp_path, mon
 
     after_each_batch(monkeypatch, go_on)
     monkeypatch.setattr(Evaluation, "on_validation_start", note)
-    config = small_config(
-        scenes,
-        "trainer.accumulate_grad_batches=3",
-        "trainer.max_seconds=1000",
-        "trainer.max_steps=4",
-        "callbacks.evaluation.at=[0,0.55]",
-    )
-    run(config, tmp_path / "run", [], resume=False)
+    limits = ("trainer.max_seconds=1000", "trainer.max_steps=4")
+    train("trainer.accumulate_grad_batches=3", *limits, "callbacks.evaluation.at=[0,0.55]")
     assert batches == [0, 9, 12]
 
 
@@ -263,17 +256,18 @@ def test_best_and_last_are_written_at_the_steps_that_say_so(watched):
     assert [step for step, name in watched.saved if name == "last.ckpt"] == [10, 20, 30, 40, 40]
 
 
-def test_deterministic_training_is_refused_on_a_gpu(scenes, tmp_path, monkeypatch):
-    monkeypatch.setattr(fit, "find_device", lambda _: torch.device("cuda"))
-    with pytest.raises(ConfigError, match=r"trainer\.deterministic=true.*trainer\.accelerator=cpu"):
-        run(small_config(scenes, "trainer.deterministic=true"), tmp_path / "run", [], resume=False)
-
-
-def test_more_gpus_than_there_are_are_refused_at_once(scenes, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("trainer.deterministic=true", r"trainer\.deterministic=true.*trainer\.accelerator=cpu"),
+        ("trainer=ddp", r"trainer\.devices=2: 1 GPUs found"),
+    ],
+)
+def test_what_a_gpu_cannot_is_refused_at_once(train, monkeypatch, override, words):
     monkeypatch.setattr(fit, "find_device", lambda _: torch.device("cuda"))
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    with pytest.raises(ConfigError, match=r"trainer\.devices=2: 1 GPUs found"):
-        run(small_config(scenes, "trainer=ddp"), tmp_path / "run", [], resume=False)
+    with pytest.raises(ConfigError, match=words):
+        train(override)
 
 
 def test_folder_with_a_run_is_refused_without_resume(trained_run, scenes):
@@ -283,44 +277,35 @@ def test_folder_with_a_run_is_refused_without_resume(trained_run, scenes):
     assert (trained_run / "metrics.json").read_bytes() == before
 
 
-def test_few_shot_run_names_its_views_and_accumulated_batches_make_one_step(scenes, tmp_path):
-    config = small_config(
-        scenes,
-        "data.views=3",
-        "trainer.accumulate_grad_batches=2",
-        "trainer.max_steps=4",
-        "callbacks.evaluation.at=[]",
-    )
-    run(config, tmp_path / "few", [], resume=False)
-    files = status(tmp_path / "few")["files"]["train"]
+def test_few_shot_run_names_its_views_and_accumulated_batches_make_one_step(train):
+    few = ("data.views=3", "trainer.max_steps=4")
+    folder = train(*few, "trainer.accumulate_grad_batches=2", UNSCORED)
+    files = status(folder)["files"]["train"]
     assert len(files) == 3
     assert files[0].endswith("r_000.png")
     assert files[-1].endswith("r_009.png")
-    state = checkpoint(tmp_path / "few")
-    assert (state["global_step"], state["progress"]["batches"]) == (4, 8)
+    assert stopped_at(folder) == (4, 8)
 
 
-def test_a_scene_without_motion_has_no_time_planes(scenes, tmp_path):
-    cases = {
-        ("data.scene=still_life",): "frames are equal",
-        ("data.scene=still_life", "data.static=false"): None,
-        ("data.scene=excavator", "data.static=true"): "data.static=true",
-    }
-    for overrides, reason in cases.items():
-        folder = tmp_path / "-".join(overrides)
-        config = small_config(
-            scenes, "trainer.max_steps=2", "callbacks.evaluation.at=[]", *overrides
-        )
-        run(config, folder, [], resume=False)
-        state = checkpoint(folder)
-        assert ("field.time" in state["state_dict"]) == (reason is None), overrides
-        assert metrics(folder)["skipped"]["static"] == (0.0 if reason is None else 1.0), overrides
-        text = (folder / "train.log").read_text()
-        assert ("trains as a static one" in text) == (reason is not None), overrides
-        assert reason is None or reason in text, overrides
+@pytest.mark.parametrize(
+    ("overrides", "reason"),
+    [
+        (["still_life"], "frames are equal"),
+        (["still_life", "data.static=false"], None),
+        (["excavator", "data.static=true"], "data.static=true"),
+    ],
+)
+def test_a_scene_without_motion_has_no_time_planes(train, overrides, reason):
+    scene, *rest = overrides
+    folder = train("trainer.max_steps=2", UNSCORED, f"data.scene={scene}", *rest)
+    assert ("field.time" in checkpoint(folder)["state_dict"]) == (reason is None)
+    assert metrics(folder)["skipped"]["static"] == (0.0 if reason is None else 1.0)
+    text = (folder / "train.log").read_text()
+    assert ("trains as a static one" in text) == (reason is not None)
+    assert reason is None or reason in text
 
 
-def test_a_bad_batch_takes_those_of_its_update_along(scenes, tmp_path, monkeypatch):
+def test_a_bad_batch_takes_those_of_its_update_along(train, monkeypatch):
     original = RayBatches.draw
 
     def spoil(self, step: int, *rest):
@@ -330,14 +315,8 @@ def test_a_bad_batch_takes_those_of_its_update_along(scenes, tmp_path, monkeypat
         return batch
 
     monkeypatch.setattr(RayBatches, "draw", spoil)
-    config = small_config(
-        scenes,
-        "trainer.accumulate_grad_batches=2",
-        "trainer.max_steps=3",
-        "callbacks.evaluation.at=[]",
-    )
-    run(config, tmp_path / "run", [], resume=False)
-    content = metrics(tmp_path / "run")
+    folder = train("trainer.accumulate_grad_batches=2", "trainer.max_steps=3", UNSCORED)
+    content = metrics(folder)
     assert (content["steps_skipped"], content["step"]) == (1, 3)
-    state = checkpoint(tmp_path / "run")
-    assert {float(each["step"]) for each in state["optimizer_states"][0]["state"].values()} == {2}
+    (optimizer,) = checkpoint(folder)["optimizer_states"]
+    assert {float(each["step"]) for each in optimizer["state"].values()} == {2}

@@ -1,6 +1,5 @@
 """A field that shows nothing is noticed, said and started again; opacity is supervised."""
 
-import csv
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,11 +8,12 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from tests.training.runs import metrics, small_config
+from tests.balls import ball_scene
+from tests.training.runs import UNSCORED, metrics
 from xplanes.errors import ConfigError
+from xplanes.files import read_rows
 from xplanes.models.base import background_opacity, opacity_error, opacity_shortfall
 from xplanes.rendering.base import Rendering
-from xplanes.run import run
 from xplanes.training import collapse
 from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.collapse import CollapseWatch, verdict
@@ -22,7 +22,7 @@ from xplanes.training.module import RadianceModule
 from xplanes.training.scores import blank_psnr, floaters, psnr_foreground
 
 FOGGY = {"foreground": 0.9, "background": 0.8}
-QUICK = ("trainer.max_steps=24", "callbacks.evaluation.at=[]", "callbacks.checkpoints.every=14")
+QUICK = ("trainer.max_steps=24", UNSCORED, "callbacks.checkpoints.every=14")
 
 
 def rendered(opacity: torch.Tensor, colour: torch.Tensor) -> Rendering:
@@ -49,10 +49,7 @@ def test_opacity_is_compared_with_alpha_or_with_what_a_colour_takes():
     assert torch.autograd.grad(air, opacity)[0].tolist() == pytest.approx([1 / 3, 0, 0])
     # Before a grey background a colour may lie on either side.
     grey = rays | {"background": torch.full((3, 3), 0.5, dtype=torch.float64)}
-    needed = torch.tensor([1.0, 1.0, 1.0])
-    assert float(opacity_shortfall(rendering, grey)) == pytest.approx(
-        float((needed - opacity.detach()).square().mean())
-    )
+    assert opacity_shortfall(rendering, grey).item() == pytest.approx((0.64 + 0.01 + 0.25) / 3)
 
 
 def test_opacities_of_foreground_and_background():
@@ -98,7 +95,7 @@ def dead(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_dead_field_starts_again_once_and_then_a_warning_is_enough(
-    scenes, tmp_path, dead, caplog
+    train, monkeypatch, dead, caplog
 ):
     fields = []
     restart = RadianceModule.restart
@@ -111,22 +108,19 @@ def test_a_dead_field_starts_again_once_and_then_a_warning_is_enough(
         assert held == set(self.field.parameters())
         fields.append(self)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(RadianceModule, "restart", noted)
-        run(small_config(scenes, *QUICK), tmp_path / "run", [], resume=False)
-    assert len(fields) == 1
+    monkeypatch.setattr(RadianceModule, "restart", noted)
+    folder = train(*QUICK)
+    assert len(fields) == metrics(folder)["restarts"] == 1
+    assert fields[0].model.opacity == 1.0
     words = [r.getMessage() for r in caplog.records if "field shows nothing" in r.getMessage()]
     assert ["again" in line for line in words] == [True, False]
     assert "at step 10" in words[0]
     assert "data.half_side" in words[1]
-    content = metrics(tmp_path / "run")
-    assert content["restarts"] == 1
-    assert fields[0].model.opacity == 1.0
 
 
-def test_a_run_that_began_again_resumes_to_the_same_numbers(scenes, tmp_path, dead):
-    config = small_config(scenes, *QUICK, "trainer.deterministic=true")
-    run(config, tmp_path / "whole", [], resume=False)
+def test_a_run_that_began_again_resumes_to_the_same_numbers(train, monkeypatch, dead):
+    options = (*QUICK, "trainer.deterministic=true")
+    whole = metrics(train(*options, name="whole"))
     save = AtomicCheckpointIO.save_checkpoint
 
     def cut_off(self, checkpoint: dict, path: str, **options) -> None:
@@ -134,12 +128,11 @@ def test_a_run_that_began_again_resumes_to_the_same_numbers(scenes, tmp_path, de
         if Path(path).name == "last.ckpt":
             raise OSError("cut off")
 
-    with pytest.MonkeyPatch.context() as patch:
+    with monkeypatch.context() as patch:
         patch.setattr(AtomicCheckpointIO, "save_checkpoint", cut_off)
         with pytest.raises(OSError, match="cut off"):
-            run(config, tmp_path / "parts", [], resume=False)
-    run(config, tmp_path / "parts", [], resume=True)
-    whole, parts = (metrics(tmp_path / name) for name in ("whole", "parts"))
+            train(*options)
+    parts = metrics(train(*options, resume=True))
     for key in ("test", "views", "restarts", "samples_per_ray"):
         assert whole[key] == parts[key], key
 
@@ -160,27 +153,20 @@ def test_the_thing_is_scored_where_most_of_a_pixel_shows_it():
     assert math.isnan(psnr_foreground(colour, truth, torch.zeros_like(mask)))
 
 
-def test_a_run_that_shows_nothing_says_so(scenes, tmp_path, capsys):
+def test_a_run_that_shows_nothing_says_so(train, capsys):
     """The decoder's density bias leaves the field empty, and there is no step to change it."""
-    config = small_config(
-        scenes, "trainer.max_steps=1", "model.decoder.density_bias=-60", "data.seed=0"
-    )
-    run(config, tmp_path / "run", [], resume=False)
+    folder = train("trainer.max_steps=1", "model.decoder.density_bias=-60", "data.seed=0")
     assert "this run shows nothing yet" in capsys.readouterr().out
-    content = metrics(tmp_path / "run")
+    content = metrics(folder)
     assert content["test"]["psnr"] == pytest.approx(content["blank_psnr"], abs=0.01)
     assert content["test"]["floaters"] == 0
-    with (tmp_path / "run" / "curve.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 2
+    assert len(read_rows(folder / "curve.csv")) == 2
 
 
 def test_blank_images_are_the_background():
-    from tests.balls import ball_scene
-
-    views = ball_scene().splits["test"]
-    black = blank_psnr(views, torch.zeros(3))
-    expected = [
-        -10 * math.log10(float(views.composite(i, torch.zeros(3)).double().square().mean()))
-        for i in range(len(views))
+    views, black = ball_scene().splits["test"], torch.zeros(3)
+    errors = [
+        float(views.composite(index, black).double().square().mean()) for index in range(len(views))
     ]
-    assert black == pytest.approx(sum(expected) / len(expected))
+    expected = sum(-10 * math.log10(error) for error in errors) / len(errors)
+    assert blank_psnr(views, black) == pytest.approx(expected)

@@ -7,14 +7,13 @@ import pytest
 import torch
 
 from tests.balls import ball_views, swinging
-from tests.training.runs import changed, checkpoint, same_state, small_config
+from tests.training.runs import UNSCORED, changed, checkpoint, same_state, small_config
 from xplanes.models import x_planes
 from xplanes.models.initialisation import Method
-from xplanes.run import run
 from xplanes.scenes.frame import cube_frame, pixels_across, pixels_of_detail
 from xplanes.training.module import RadianceModule
 
-FINE = ("model.fine.texels=40", "model.fine.start=8", "model.fine.channels=3")
+FINE = ("model.fine.texels=40", "model.fine.start=8", "model.fine.channels=3", UNSCORED)
 
 
 def settings(*overrides: str):
@@ -46,26 +45,23 @@ def test_they_may_be_given_or_left_out():
     assert changed(("recipe=paper",))["model"]["fine"] is None
 
 
-def test_they_are_zero_until_their_first_step_and_go_on_exactly(scenes, tmp_path):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
+def test_they_are_zero_until_their_first_step_and_go_on_exactly(train):
     for steps in (8, 9, 12):
         # A limit in steps is no schedule: the rates depend on the share of it that is done.
-        config = small_config(scenes, *FINE, "model.final_lr=1.0", f"trainer.max_steps={steps}")
-        run(config, parts, [], resume=steps > 8)
-        fine = checkpoint(parts)["state_dict"]["field.fine"]
+        options = (*FINE, "model.final_lr=1.0", f"trainer.max_steps={steps}")
+        parts = checkpoint(train(*options, name="parts", resume=steps > 8))
+        fine = parts["state_dict"]["field.fine"]
         assert fine.shape == (3, 40, 40, 3)
         assert bool(fine.any()) == (steps > 8)
-    run(config, whole, [], resume=False)
-    first, second = checkpoint(whole), checkpoint(parts)
-    same_state(first["state_dict"], second["state_dict"])
-    groups = first["optimizer_states"][0]["param_groups"]
+    whole = checkpoint(train(*options, name="whole"))
+    same_state(whole["state_dict"], parts["state_dict"])
+    groups = whole["optimizer_states"][0]["param_groups"]
     assert [group["name"] for group in groups] == ["space", "time", "fine", "decoder"]
 
 
-def test_a_checkpoint_knows_how_many_texels_the_images_asked_for(scenes, tmp_path, monkeypatch):
+def test_a_checkpoint_knows_how_many_texels_the_images_asked_for(train, monkeypatch):
     monkeypatch.setattr(x_planes, "TEXEL_STEP", 4)
-    config = small_config(scenes, "model.resolution=8", "trainer.max_steps=2")
-    run(config, tmp_path, [], resume=False)
-    module = RadianceModule.load_from_checkpoint(tmp_path / "checkpoints" / "last.ckpt")
+    folder = train("model.resolution=8", "trainer.max_steps=2", UNSCORED)
+    module = RadianceModule.load_from_checkpoint(folder / "checkpoints" / "last.ckpt")
     texels = module.method.model.fine_texels(module.site.pixels)
     assert texels == module.field.fine.shape[1] > 8

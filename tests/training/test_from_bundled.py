@@ -7,12 +7,11 @@ import pytest
 import torch
 
 from tests.balls import ball_scene
-from tests.training.runs import changed, composed, metrics, small_config
+from tests.training.runs import changed, composed, metrics
 from xplanes.files import read_rows
 from xplanes.lrm.bundled import bundled_models
 from xplanes.models.initialisation import Initialisation, Method, Place
 from xplanes.preparation.sources import LRMInitialiser
-from xplanes.run import run
 from xplanes.scenes.frame import scene_frame
 from xplanes.tools.runs import load_run
 
@@ -27,20 +26,9 @@ SETTINGS = (
 )
 
 
-@pytest.fixture(scope="module")
-def train(scenes: Path):
-    def train(folder: Path, *overrides: str) -> list[float]:
-        """PSNR at step 0 and at the end of a run."""
-        run(small_config(scenes, *SETTINGS, *overrides), folder, [], resume=False)
-        return [float(row["psnr"]) for row in read_rows(folder / "curve.csv")]
-
-    return train
-
-
-@pytest.fixture(scope="module")
-def random(train, tmp_path_factory: pytest.TempPathFactory) -> list[float]:
-    """PSNR of random initialisation."""
-    return train(tmp_path_factory.mktemp("random") / "run", "lrm=none")
+def psnr(folder: Path) -> list[float]:
+    """PSNR at step 0 and at the end of a run."""
+    return [float(row["psnr"]) for row in read_rows(folder / "curve.csv")]
 
 
 def test_the_default_initialisation_is_a_bundled_model():
@@ -75,19 +63,20 @@ def test_without_a_video_only_an_lrm_that_is_asked_for_sees_a_scene(
 
 
 @pytest.mark.parametrize("name", ["auto", pytest.param("mini", marks=pytest.mark.slow)])
-def test_it_knows_the_scene_before_the_first_step(train, random, tmp_path, name):
-    informed = train(tmp_path / "run", f"lrm={name}")
+def test_it_knows_the_scene_before_the_first_step(train, name):
+    random = psnr(train(*SETTINGS, "lrm=none", name="random"))
+    folder = train(*SETTINGS, f"lrm={name}")
+    informed = psnr(folder)
     assert informed[0] > random[0] + 3
     assert informed[-1] > random[-1] + 1
-    content = metrics(tmp_path / "run")
+    content = metrics(folder)
     assert content["lrm"]["mismatch_pixels"]["largest"] < 0.1
     assert content["seconds"]["prepare"]["lrm"] > 0
     assert content["seconds"]["prepare"]["fill"] > 0
 
 
-def test_a_scene_without_motion_trains_as_a_static_one(train, tmp_path):
-    folder = tmp_path / "run"
-    train(folder, "lrm=tiny", "data.scene=still_life", "trainer.max_steps=1")
+def test_a_scene_without_motion_trains_as_a_static_one(train):
+    folder = train(*SETTINGS, "lrm=tiny", "data.scene=still_life", "trainer.max_steps=1")
     assert (metrics(folder)["lrm"]["frames"], metrics(folder)["lrm"]["distinct"]) == (1, 1)
     assert metrics(folder)["decomposition"] == {}
     loaded = load_run(folder)

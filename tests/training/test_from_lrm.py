@@ -1,6 +1,7 @@
 """Runs initialised from a Large Reconstruction Model: stages, files, resuming."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,28 +15,22 @@ from xplanes.tools.evaluate import evaluate
 from xplanes.tools.runs import load_run
 
 
-@pytest.fixture(scope="module")
-def settings(scenes: Path):
-    def settings(place: Path, name: str, *overrides: str) -> dict:
-        return small_config(
-            scenes,
-            *CHOICES[name],
-            f"lrm.weights={publish(place / name, name)}",
-            f"preparation.cache={place}/cache",
-            "preparation.frames=3",
-            "preparation.fixed_view_seconds=1000",
-            "preparation.fixed_view_steps=4",
-            "trainer.max_steps=6",
-            "callbacks.evaluation.at=[0]",
-            *overrides,
-        )
-
-    return settings
+def source(place: Path, name: str) -> tuple[str, ...]:
+    """Overrides of runs from an LRM, whose weights and cache lie in a folder."""
+    return (
+        *CHOICES[name],
+        *(f"lrm.weights={publish(place / name, name)}", f"preparation.cache={place}/cache"),
+        *("preparation.frames=3", "preparation.fixed_view_seconds=1000"),
+        *("preparation.fixed_view_steps=4", "trainer.max_steps=6", "callbacks.evaluation.at=[0]"),
+    )
 
 
-def test_a_run_from_the_scenes_video(settings, tmp_path):
-    folder = tmp_path / "run"
-    run(settings(tmp_path, "triposr", "model=nine_planes"), folder, [], resume=False)
+RENDERED = "preparation.fixed_view=train"
+"""The fixed-view video is rendered by a field."""
+
+
+def test_a_run_from_the_scenes_video(train, tmp_path):
+    folder = train(*source(tmp_path, "triposr"), "model=nine_planes")
     told = metrics(folder)
     seconds = told["seconds"]["prepare"]
     assert set(seconds) == set(STAGES)
@@ -52,22 +47,21 @@ def test_a_run_from_the_scenes_video(settings, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(settings, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run whose fixed-view video is rendered by a field."""
+def uninterrupted(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Metrics of a run that nobody stopped."""
     place = tmp_path_factory.mktemp("uninterrupted")
-    config = settings(place, "openlrm-1.1", "preparation.fixed_view=train")
+    config = small_config(scenes, *source(place, "openlrm-1.1"), RENDERED)
     run(config, place / "run", [], resume=False)
-    return place / "run"
+    return metrics(place / "run")
 
 
 @pytest.mark.parametrize(
     "stopped", [pytest.param("encode", marks=pytest.mark.slow), "from_sequence"]
 )
 def test_a_stopped_preparation_resumes_from_the_last_finished_stage(
-    settings, uninterrupted, tmp_path, monkeypatch, stopped
+    train, uninterrupted, tmp_path, monkeypatch, stopped
 ):
-    folder = tmp_path / "run"
-    config = settings(tmp_path, "openlrm-1.1", "preparation.fixed_view=train")
+    overrides = (*source(tmp_path, "openlrm-1.1"), RENDERED)
     owner = sources_module if stopped == "from_sequence" else reconstruct_module
 
     def stop(*_args, **_options):
@@ -76,15 +70,14 @@ def test_a_stopped_preparation_resumes_from_the_last_finished_stage(
     with monkeypatch.context() as patch:
         patch.setattr(owner, stopped, stop)
         with pytest.raises(KeyboardInterrupt):
-            run(config, folder, [], resume=False)
-    assert status(folder)["status"] == "interrupted"
+            train(*overrides)
+    assert status(tmp_path / "run")["status"] == "interrupted"
     kept = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "cache").glob("*.pt")}
     assert any(name.startswith("fixed_view") for name in kept)
     assert any(name.startswith("triplane") for name in kept) == (stopped == "from_sequence")
-    run(config, folder, [], resume=True)
+    told = metrics(train(*overrides, resume=True))
     for name, written in kept.items():
         assert (tmp_path / "cache" / name).stat().st_mtime_ns == written
-    told = metrics(folder)
     assert told["seconds"]["prepare"]["fixed_view"] > 0
     assert "rendered by six_planes" in told["lrm"]["fixed_view"]
-    assert told["test"] == metrics(uninterrupted)["test"]
+    assert told["test"] == uninterrupted["test"]

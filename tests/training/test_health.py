@@ -15,6 +15,7 @@ from torch import nn
 
 from tests.refusals import assert_refused
 from tests.training.runs import (
+    UNSCORED,
     after_each_batch,
     checkpoint,
     metrics,
@@ -41,28 +42,27 @@ from xplanes.training.losses import loss_terms
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import claim, keeping_settings
 
-UNSCORED = ("callbacks.checkpoints.every=5", "callbacks.evaluation.at=[]", "data.eval_views=1")
-LONG = ("trainer.max_steps=40", *UNSCORED)
+OFTEN = ("callbacks.checkpoints.every=5", "data.eval_views=1", UNSCORED)
+LONG = ("trainer.max_steps=40", *OFTEN)
 """More steps than may be left out in a row."""
 
-FEW = ("trainer.max_steps=12", *UNSCORED)
+FEW = ("trainer.max_steps=12", *OFTEN)
 SCORED = (*FEW, "callbacks.evaluation.at=[0.4]")
 
 
-def test_a_gradient_is_usable_if_adam_can_square_it():
-    values = {0.0: True, 1e18: True, 2e19: False, math.inf: False, math.nan: False}
-    for layout in (torch.contiguous_format, torch.channels_last):
-        for value, expected in values.items():
-            gradient = torch.zeros(1, 4, 3, 5).to(memory_format=layout)
-            gradient[0, 2, 1, 3] = value
-            case = f"{value}, {layout}"
-            assert usable(gradient) is expected, case
-            others = [nn.Parameter(torch.zeros(7)), nn.Parameter(torch.zeros_like(gradient))]
-            others[0].grad, others[1].grad = torch.ones(7), gradient
-            assert float(broken_flag(others, [torch.tensor(0.3)])) == float(not expected), case
-            assert float(broken_flag(others, [torch.tensor(0.3), torch.tensor(math.nan)])) == 1.0, (
-                case
-            )
+@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last], ids=str)
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [(0.0, True), (1e18, True), (2e19, False), (math.inf, False), (math.nan, False)],
+)
+def test_a_gradient_is_usable_if_adam_can_square_it(value, expected, layout):
+    gradient = torch.zeros(1, 4, 3, 5).to(memory_format=layout)
+    gradient[0, 2, 1, 3] = value
+    assert usable(gradient) is expected
+    others = [nn.Parameter(torch.zeros(7)), nn.Parameter(torch.zeros_like(gradient))]
+    others[0].grad, others[1].grad = torch.ones(7), gradient
+    for terms, broken in (([0.3], not expected), ([0.3, math.nan], True)):
+        assert float(broken_flag(others, list(map(torch.tensor, terms)))) == broken
 
 
 def test_names_are_those_of_the_broken():
@@ -93,20 +93,25 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PATIENCE", 3)
 
 
-def test_one_bad_gradient_costs_one_step(scenes, tmp_path, monkeypatch):
+def refused(words: str, config: dict, folder: Path) -> str:
+    """Training ends with an error that says this. Returns what it says."""
+    train = partial(run, config, folder, [], resume=False)
+    return assert_refused(TrainingError, words, train, folder.name)
+
+
+def test_one_bad_gradient_costs_one_step(train, monkeypatch):
     spoil_gradient(monkeypatch, 1e25, range(3, 4))
-    run(small_config(scenes, *FEW, "trainer.max_steps=6"), tmp_path, [], resume=False)
-    content = metrics(tmp_path)
+    folder = train(*FEW, "trainer.max_steps=6")
+    content = metrics(folder)
     assert (content["steps_skipped"], content["step"]) == (1, 6)
-    assert not_finite(checkpoint(tmp_path)["state_dict"].items()) == []
+    assert not_finite(checkpoint(folder)["state_dict"].items()) == []
 
 
 def test_gradients_that_stay_bad_end_training_with_a_message(scenes, tmp_path, monkeypatch):
     spoil_gradient(monkeypatch, math.nan, range(8, 1000))
     words = r"20 steps.*from step 7 on.*gradient of field\.space.*resume="
-    with pytest.raises(TrainingError, match=words):
-        run(small_config(scenes, *LONG), tmp_path / "all", [], resume=False)
-    kept = checkpoint(tmp_path / "all")
+    refused(words, small_config(scenes, *LONG), tmp_path)
+    kept = checkpoint(tmp_path)
     # Left out, a step counts, and changes nothing.
     assert kept["global_step"] == 25
     assert {float(each["step"]) for each in kept["optimizer_states"][0]["state"].values()} == {7}
@@ -114,14 +119,12 @@ def test_gradients_that_stay_bad_end_training_with_a_message(scenes, tmp_path, m
 
 def test_gradients_that_are_bad_from_the_first_step_on(scenes, tmp_path, monkeypatch, impatient):
     spoil_gradient(monkeypatch, 1e30, range(1000))
+    config = small_config(scenes, *LONG)
     words = r"step 0 on.*gradient of field\.space.*check the values and gradients of XPlanes"
-    with pytest.raises(TrainingError, match=words):
-        run(small_config(scenes, *LONG), tmp_path / "random", [], resume=False)
-    with pytest.raises(TrainingError, match=r"step 0 on.*of XPlanes and losses\.mine"):
-        run(with_loss(scenes, first=99), tmp_path / "loss", [], resume=False)
+    refused(words, config, tmp_path / "random")
+    refused(r"step 0 on.*of XPlanes and losses\.mine", with_loss(scenes, 99), tmp_path / "loss")
     initialised_as(True, monkeypatch)
-    with pytest.raises(TrainingError, match=r"step 0 on.*initialisation is to blame.*lrm=none"):
-        run(small_config(scenes, *LONG), tmp_path / "start", [], resume=False)
+    refused(r"step 0 on.*initialisation is to blame.*lrm=none", config, tmp_path / "start")
 
 
 def initialised_as(known: bool, monkeypatch: pytest.MonkeyPatch, spoil: bool = False) -> None:
@@ -171,12 +174,11 @@ def with_loss(scenes: Path, first: int) -> dict:
 
 @pytest.mark.parametrize(("first", "more"), [(0, r"omit it$"), (7, r"omit it; resume=")])
 def test_an_added_loss_that_is_not_finite_is_named(scenes, tmp_path, impatient, first, more):
-    said = refused(with_loss(scenes, first=first), tmp_path / "run")
-    assert re.search(
-        rf"the loss was nan.*from step {first} on; not finite: losses\.mine; largest", said
+    words = (
+        rf"the loss was nan.*from step {first} on; not finite: losses\.mine; largest"
+        rf".*The rendering is finite: correct losses\.mine or {more}"
     )
-    assert re.search(rf"The rendering is finite: correct losses\.mine or {more}", said)
-    assert "initialisation" not in said
+    assert "initialisation" not in refused(words, with_loss(scenes, first), tmp_path)
 
 
 def terms_with(name: str, form: str, own: Any = 0.0) -> dict[str, torch.Tensor]:
@@ -204,27 +206,22 @@ def test_a_term_of_the_loss_is_one_number_and_takes_no_other_ones_place():
         terms_with("own", "one")
 
 
-def test_the_initialisation_is_blamed_if_there_was_one_and_it_renders_nothing_finite(
-    scenes, tmp_path, monkeypatch, impatient
-):
-    for initialised, words in (
-        (True, "initialisation is to blame.*set lrm=none"),
+@pytest.mark.parametrize(
+    ("initialised", "words"),
+    [
+        (True, r"initialisation is to blame.*set lrm=none"),
         (False, r"No step was done yet: check the values and gradients of XPlanes"),
-    ):
-        with monkeypatch.context() as patch:
-            initialised_as(initialised, patch, spoil=True)
-            said = refused(small_config(scenes, *LONG), tmp_path / f"{initialised}")
-        assert re.search(words, said), said
-        assert ("initialisation" in said) == initialised
+    ],
+)
+def test_the_initialisation_is_blamed_if_there_was_one_and_it_renders_nothing_finite(
+    scenes, tmp_path, monkeypatch, impatient, initialised, words
+):
+    initialised_as(initialised, monkeypatch, spoil=True)
+    said = refused(words, small_config(scenes, *LONG), tmp_path)
+    assert ("initialisation" in said) == initialised
 
 
-def refused(config: dict, folder: Path) -> str:
-    with pytest.raises(TrainingError) as caught:
-        run(config, folder, [], resume=False)
-    return str(caught.value)
-
-
-def test_a_checkpoint_never_holds_what_is_not_finite(scenes, tmp_path, monkeypatch):
+def test_a_checkpoint_never_holds_what_is_not_finite(train, tmp_path, monkeypatch):
     def spoil(_, trainer, module) -> None:
         if trainer.global_step == 10:
             with torch.no_grad():
@@ -232,11 +229,10 @@ def test_a_checkpoint_never_holds_what_is_not_finite(scenes, tmp_path, monkeypat
 
     after_each_batch(monkeypatch, spoil)
     with pytest.raises(TrainingError, match=r"step 10: field\.decoder\.layers\.0\.bias"):
-        run(small_config(scenes, *FEW), tmp_path / "spoiled", [], resume=False)
-    assert checkpoint(tmp_path / "spoiled")["global_step"] == 5
+        train(*FEW)
+    assert checkpoint(tmp_path / "run")["global_step"] == 5
     monkeypatch.undo()
-    run(small_config(scenes, *FEW), tmp_path / "spoiled", [], resume=True)
-    assert checkpoint(tmp_path / "spoiled")["global_step"] == 12
+    assert checkpoint(train(*FEW, resume=True))["global_step"] == 12
 
 
 @pytest.fixture(scope="module")
@@ -253,7 +249,7 @@ def folder(whole: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "run"))
 
 
-def test_a_resumed_run_takes_new_learning_rates(scenes, folder, monkeypatch):
+def test_a_resumed_run_takes_new_learning_rates(train, folder, monkeypatch):
     seen = []
     original = RadianceModule.on_train_batch_start
 
@@ -263,15 +259,11 @@ def test_a_resumed_run_takes_new_learning_rates(scenes, folder, monkeypatch):
         seen.append([group["lr"] for group in optimizer.param_groups])
 
     monkeypatch.setattr(RadianceModule, "on_train_batch_start", note)
-    changed = (*FEW, "trainer.max_steps=14", "model.plane_lr=0.02", "model.warmup_steps=0")
-    run(small_config(scenes, *changed), folder, [], resume=True)
+    changed = ("trainer.max_steps=14", "model.plane_lr=0.02", "model.warmup_steps=0")
+    train(*FEW, *changed, resume=True)
     assert len(seen) == 2
     assert all(rates[0] < 0.021 for rates in seen)
     assert seen[0][1] == pytest.approx(10 * seen[0][0])
-
-
-def shortened(content: bytes) -> bytes:
-    return content[:-1000]
 
 
 def flipped(content: bytes) -> bytes:
@@ -279,15 +271,15 @@ def flipped(content: bytes) -> bytes:
     return content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :]
 
 
-def test_a_damaged_checkpoint_gives_way_to_the_best(scenes, whole, folder, caplog):
+def test_a_damaged_checkpoint_gives_way_to_the_best(train, whole, folder, caplog):
     last, best = (folder / "checkpoints" / f"{name}.ckpt" for name in ("last", "best"))
     content = last.read_bytes()
-    last.write_bytes(shortened(content))
+    last.write_bytes(content[:-1000])
     assert find_resumable(last.parent) == last
     assert last.read_bytes() == best.read_bytes() != content
     last.write_bytes(flipped(content))
     caplog.clear()
-    run(small_config(scenes, *SCORED), folder, [], resume=True)
+    train(*SCORED, resume=True)
     assert "last.ckpt cannot be read" in caplog.text
     assert "Continuing from" in caplog.text
     same_state(checkpoint(whole)["state_dict"], checkpoint(folder)["state_dict"])
@@ -314,9 +306,8 @@ def test_a_sound_checkpoint_that_cannot_be_read_is_not_called_damaged(tmp_path):
 
 
 def test_checkpoints_without_a_record_are_not_overwritten(tmp_path):
-    save = tmp_path / "checkpoints/last.ckpt"
-    save.parent.mkdir()
-    save.write_bytes(b"")
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "last.ckpt").touch()
     with pytest.raises(ConfigError, match=r"holds checkpoints, but no run\.json\. Choose another"):
         claim(tmp_path, resume=False)
 
@@ -329,11 +320,11 @@ def test_a_refused_resume_keeps_the_earlier_settings(tmp_path, refusal):
     assert (tmp_path / "config.yaml").read_text() == "seed: 1\n"
 
 
-def test_a_damaged_record_does_not_end_a_run(scenes, folder, caplog):
+def test_a_damaged_record_does_not_end_a_run(train, folder, caplog):
     (folder / "run.json").write_text('{"status": "runn')
     with pytest.raises(ConfigError, match=r"holds a run already \(damaged\)"):
-        run(small_config(scenes, *SCORED), folder, [], resume=False)
-    run(small_config(scenes, *SCORED), folder, [], resume=True)
+        train(*SCORED)
+    train(*SCORED, resume=True)
     assert "record of this run starts again" in caplog.text
     record = status(folder)
     assert (record["status"], record["resumed"]) == ("finished", 1)

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from tests.training.runs import checkpoint, same_state, small_config
-from xplanes.run import run
+from tests.training.runs import UNSCORED, checkpoint, same_state
 from xplanes.scenes import importance
 from xplanes.training import module
 from xplanes.training.module import RadianceModule
@@ -29,31 +28,27 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, bool]]:
     return drawn
 
 
-def test_rays_are_weighted_from_its_first_batch_on_and_a_resumed_run_draws_the_same(
-    scenes, tmp_path, soon
-):
+def test_rays_are_weighted_from_its_first_batch_on_and_a_resumed_run_draws_the_same(train, soon):
     for steps in (5, 11):
-        config = small_config(scenes, "model.final_lr=1.0", f"trainer.max_steps={steps}")
-        run(config, tmp_path / "parts", [], resume=steps > 5)
+        options = ("model.final_lr=1.0", UNSCORED, f"trainer.max_steps={steps}")
+        parts = checkpoint(train(*options, name="parts", resume=steps > 5))
     assert soon == [(batch, batch >= 3) for batch in range(11)]
-    run(config, tmp_path / "whole", [], resume=False)
-    parts, whole = checkpoint(tmp_path / "parts"), checkpoint(tmp_path / "whole")
+    whole = checkpoint(train(*options, name="whole"))
     same_state(whole["state_dict"], parts["state_dict"])
     assert torch.equal(whole["error_map"]["sums"], parts["error_map"]["sums"])
     assert whole["error_map"]["sums"][:, 1].sum() > 0
 
 
 @pytest.mark.parametrize("override", ["model.rays.error_share=0", "recipe=fair"])
-def test_without_it_no_ray_is_weighted(scenes, tmp_path, soon, override):
-    run(small_config(scenes, override, "trainer.max_steps=5"), tmp_path, [], resume=False)
+def test_without_it_no_ray_is_weighted(train, soon, override):
+    folder = train(override, "trainer.max_steps=5", UNSCORED)
     assert soon == [(batch, False) for batch in range(5)]
-    assert checkpoint(tmp_path)["error_map"]["sums"].numel() == 0
+    assert checkpoint(folder)["error_map"]["sums"].numel() == 0
 
 
-def test_a_checkpoint_without_a_map_is_read(scenes, tmp_path, soon):
-    run(small_config(scenes, "trainer.max_steps=4"), tmp_path, [], resume=False)
-    path = tmp_path / "checkpoints" / "last.ckpt"
-    content = checkpoint(tmp_path)
+def test_a_checkpoint_without_a_map_is_read(train, soon):
+    folder = train("trainer.max_steps=4", UNSCORED)
+    path, content = folder / "checkpoints" / "last.ckpt", checkpoint(folder)
     del content["error_map"]
     torch.save(content, path)
     assert RadianceModule.load_from_checkpoint(path).error_map.errors is None

@@ -14,46 +14,50 @@ from xplanes.streams import step_generator
 FRAMES = 5
 
 
-def case(plane_set="six", count=2, **options):
-    generator = torch.Generator().manual_seed(0)
-    planes = torch.randn(3 if plane_set == "six" else 6, 4, 6, 2, generator=generator)
-    sparse = blob(FRAMES, 2, 6)
-    return SparseProduct(sparse, PLANE_SETS[plane_set], count, **options), planes, sparse
+def time_planes(plane_set, *shape, seed=0, **options):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(3 if plane_set == "six" else 6, *shape, generator=generator, **options)
+
+
+def gradient_of_the_twin(planes, sparse, rows):
+    """The value and the gradient of the loss over all frames."""
+    leaf = planes.clone().requires_grad_()
+    loss = sparse_product_loss(leaf, sparse, torch.arange(len(sparse)), rows=rows)
+    loss.backward()
+    return float(loss.detach()), leaf.grad
 
 
 @pytest.mark.parametrize(("plane_set", "reduction"), [("six", "mean"), ("nine", "sum")])
 def test_the_mean_over_steps_is_the_gradient_over_all_frames(plane_set, reduction):
-    product, planes, sparse = case(plane_set, reduction=reduction)
-    leaf = planes.clone().requires_grad_()
-    rows = PLANE_SETS[plane_set]
-    sparse_product_loss(leaf, sparse, torch.arange(FRAMES), rows=rows).backward()
-    total = torch.zeros_like(planes)
-    steps = 2000
+    rows, planes, sparse = (
+        PLANE_SETS[plane_set],
+        time_planes(plane_set, 4, 6, 2),
+        blob(FRAMES, 2, 6),
+    )
+    product = SparseProduct(sparse, rows, 2, reduction=reduction)
+    total, steps = torch.zeros_like(planes), 2000
     for step in range(steps):
         product.add_gradient(total, planes, 0.5, step_generator(0, step, 7))
-    expected = 0.5 * leaf.grad * (sparse.numel() if reduction == "sum" else 1)
+    _, gradient = gradient_of_the_twin(planes, sparse, rows)
+    expected = 0.5 * gradient * (sparse.numel() if reduction == "sum" else 1)
     assert (total / steps - expected).norm() < 0.05 * expected.norm()
     with pytest.raises(ValueError, match="reduction is 'total': allowed are mean, sum"):
-        case(reduction="total")
+        SparseProduct(sparse, rows, 2, reduction="total")
 
 
 @pytest.mark.parametrize("plane_set", ["six", "nine"])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_the_closed_form_is_the_gradient_and_the_value_of_the_twin(plane_set, dtype):
-    generator = torch.Generator().manual_seed(0)
-    rows = PLANE_SETS[plane_set]
-    sparse = torch.randn(FRAMES, 3, 2, 6, 8, generator=generator, dtype=torch.float64).to(dtype)
-    planes = torch.randn(3 if plane_set == "six" else 6, 4, 7, 2, generator=generator, dtype=dtype)
-    leaf = planes.clone().requires_grad_()
-    loss = sparse_product_loss(leaf, sparse, torch.arange(FRAMES), rows=rows)
-    loss.backward()
+    rows, planes = PLANE_SETS[plane_set], time_planes(plane_set, 4, 7, 2, dtype=dtype)
+    generator = torch.Generator().manual_seed(1)
+    sparse = torch.randn(FRAMES, 3, 2, 6, 8, generator=generator, dtype=dtype)
+    value, gradient = gradient_of_the_twin(planes, sparse, rows)
     for reduction, factor in (("mean", 1), ("sum", sparse.numel())):
         product = SparseProduct(sparse, rows, None, reduction=reduction)
-        found = torch.zeros_like(planes)
+        found, expected = torch.zeros_like(planes), factor * gradient
         product.add_gradient(found, planes, 1.0, torch.Generator())
-        expected = factor * leaf.grad
         assert (found - expected).abs().max() < 1e-6 * expected.abs().max()
-        assert product.value(planes) == pytest.approx(factor * float(loss.detach()), rel=1e-6)
+        assert product.value(planes) == pytest.approx(factor * value, rel=1e-6)
 
 
 class Sizes(TorchDispatchMode):
@@ -81,9 +85,8 @@ def test_a_gradient_over_all_frames_makes_nothing_near_the_size_of_the_sparse_pa
         product.add_gradient(gradient, planes, 1.0, torch.Generator())
     with Sizes() as value:
         product.value(planes)
-    leaf = planes.clone().requires_grad_()
     with Sizes() as twin:
-        sparse_product_loss(leaf, sparse, torch.arange(9), rows=rows).backward()
+        gradient_of_the_twin(planes, sparse, rows)
     assert closed.largest < sparse.numel() / 8
     assert value.largest < sparse.numel() / 8
     assert twin.largest >= sparse.numel() / 3

@@ -1,6 +1,5 @@
 """recipe=paper: its settings, and that what it computes is what its sources print."""
 
-import csv
 import itertools
 import json
 import shutil
@@ -13,14 +12,15 @@ import torch
 from tests.balls import ball_scene
 from tests.baselines.runs import KPLANES, PROPOSAL
 from tests.preparation.sequences import moving_sequence
-from tests.training.runs import SMALL, changed
+from tests.training.runs import SMALL, changed, metrics
 from xplanes.baselines.products import PlaneProducts, PlaneTerms
 from xplanes.baselines.tensor4d.model import FeatureSmoothness
 from xplanes.config import compose_plain
-from xplanes.decomposition import decompose, time_planes
+from xplanes.decomposition import decompose, sparse_product_loss
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
+from xplanes.files import read_rows
 from xplanes.models.base import InitialValues
 from xplanes.models.initialisation import Initialisation
 from xplanes.preparation import TriplaneSequence, fixed_view, save_triplanes
@@ -33,48 +33,29 @@ from xplanes.training.module import RadianceModule
 LRMS = ("tiny", "mini", "small", "base", "large", "xlarge")
 
 METHOD = {
-    "static": "middle",
-    "dynamic": "ones",
-    "method": "admm",
-    "sparsity_weight": 0.009,
-    "penalty": 0.05,
-    "scale": "none",
+    **{"static": "middle", "dynamic": "ones", "method": "admm", "scale": "none"},
+    **{"sparsity_weight": 0.009, "penalty": 0.05},
 }
 FIXED_VIEW = {
-    "fixed_view": "train",
-    "fixed_view_model": "kplanes",
-    "fixed_view_steps": 30000,
-    "fixed_view_seconds": None,
-    "frames": None,
+    **{"fixed_view": "train", "fixed_view_model": "kplanes", "fixed_view_steps": 30000},
+    **{"fixed_view_seconds": None, "frames": None},
 }
 LOSS = {
-    "opacity": 0.0,
-    "floaters": 0.0,
-    "variation": "coded",
-    "time_magnitude": 0.0,
-    "sparse_weight": 1.0,
-    "sparse_reduction": "sum",
-    "sparse_frames": None,
-    "initial_weight": 0.0,
-    "initial_steps": None,
-    "every": 1,
+    **{"opacity": 0.0, "floaters": 0.0, "variation": "coded", "time_magnitude": 0.0, "every": 1},
+    **{"sparse_weight": 1.0, "sparse_reduction": "sum", "sparse_frames": None},
+    **{"initial_weight": 0.0, "initial_steps": None},
 }
+TERMS = ("total_variation", "time_variation", "time_smoothness", "time_identity")
 OWN = {
     "six_planes": {
-        "loss": {
-            **{"total_variation": 1e-4, "time_variation": 1e-4},
-            **{"time_smoothness": 3e-2, "time_identity": 3e-4},
-        },
+        "loss": dict(zip(TERMS, (1e-4, 1e-4, 3e-2, 3e-4), strict=True)),
         "rates": (0.01, 0.01, 0.01),
         "schedule": (512, 0.0),
         "rays": (4096, "one"),
         "losses": {},
     },
     "nine_planes": {
-        "loss": {
-            **{"total_variation": 0.0, "time_variation": 0.0},
-            **{"time_smoothness": 0.0, "time_identity": 0.0},
-        },
+        "loss": dict.fromkeys(TERMS, 0.0),
         "rates": (0.0025, 0.0025, 0.0005),
         "schedule": (2000, 0.1),
         "rays": (512, "white"),
@@ -187,42 +168,20 @@ def test_k_planes_terms_are_those_of_k_planes_on_the_same_planes():
             torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-9, msg=name)
 
 
-def test_l_r_is_the_sum_over_all_entries_in_every_step():
-    for name in OWN:
-        off = ("total_variation", "time_variation", "time_smoothness", "time_identity")
-        zero = [f"model.loss.{key}=0" for key in off]
-        module, sparse = module_of(f"model={name}", *zero)
-        planes = module.field.time.detach().double().requires_grad_()
-        total = torch.zeros((), dtype=torch.float64)
-        for frame in range(4):
-            # Rows of time lie at t (Rt - 1), texels at their centres.
-            place = frame / 3 * 2
-            low = min(int(place), 1)
-            rows = torch.lerp(planes[:, low], planes[:, low + 1], place - low)
-            at = ((torch.arange(6) + 0.5) / 6 * 8 - 0.5).double()
-            left, share = at.floor().long(), (at - at.floor())[:, None]
-            values = torch.lerp(rows[:, left], rows[:, left + 1], share)
-            for index, (first, second) in enumerate(PLANE_SETS[module.field.plane_set]):
-                product = torch.einsum("wc,hc->chw", values[first], values[second])
-                total = total + (sparse[frame, index].double() - product).square().sum()
-        total.backward()
-        assert module.model.regularisers(STATE) == pytest.approx({"l_r": total.item()}, rel=1e-5)
-        for step in range(3):
-            for parameter in module.field.parameters():
-                parameter.grad = torch.zeros_like(parameter)
-            module.model.regularise(TrainingState(seed=0, step=step, batch=step, rank=0))
-            torch.testing.assert_close(
-                module.field.time.grad.double(), planes.grad, rtol=1e-4, atol=1e-4
-            )
-            assert not module.field.space.grad.any()
-
-
-def test_time_planes_begin_as_k_planes_do():
-    sparse = torch.randn(5, 3, 2, 6, 6)
-    for plane_set in ("six", "nine"):
-        planes = time_planes(sparse, plane_set=plane_set, dynamic="ones", time_resolution=3)
-        assert planes.shape == (len(TIME_PLANES[plane_set]), 3, 6, 2)
-        assert (planes == 1).all()
+@pytest.mark.parametrize("name", OWN)
+def test_l_r_is_the_sum_over_all_entries_in_every_step(name):
+    module, sparse = module_of(f"model={name}", *(f"model.loss.{term}=0" for term in TERMS))
+    planes = module.field.time.detach().clone().requires_grad_()
+    rows = PLANE_SETS[module.field.plane_set]
+    mean = sparse_product_loss(planes, sparse, torch.arange(len(sparse)), rows=rows)
+    (total := mean * sparse.numel()).backward()
+    assert module.model.regularisers(STATE) == pytest.approx({"l_r": total.item()}, rel=1e-5)
+    for step in range(3):
+        for parameter in module.field.parameters():
+            parameter.grad = torch.zeros_like(parameter)
+        module.model.regularise(TrainingState(seed=0, step=step, batch=step, rank=0))
+        torch.testing.assert_close(module.field.time.grad, planes.grad, rtol=1e-4, atol=1e-4)
+        assert not module.field.space.grad.any()
 
 
 def test_the_features_may_not_change_over_a_small_distance():
@@ -262,59 +221,53 @@ def test_a_run_logs_every_term_in_its_loss(model, scenes, tmp_path):
     sequence = moving_sequence()
     save_triplanes(tmp_path / "triplanes.pt", TriplaneSequence(sequence))
     config = small(
-        f"model={model}",
-        "lrm=file",
-        "logger=csv",
-        f"lrm.triplanes={tmp_path}/triplanes.pt",
-        f"data.root={scenes}",
-        "preparation.cache=null",
-        "trainer.max_steps=3",
-        "trainer.log_every_n_steps=1",
-        "callbacks.evaluation.at=[]",
+        *(f"model={model}", "lrm=file", f"lrm.triplanes={tmp_path}/triplanes.pt"),
+        *(f"data.root={scenes}", "preparation.cache=null", "callbacks.evaluation.at=[]"),
+        *("trainer.max_steps=3", "trainer.log_every_n_steps=1", "logger=csv"),
     )
     run(config, tmp_path / "run", [], resume=False)
     (path,) = (tmp_path / "run").rglob("metrics.csv")
-    with path.open() as file:
-        rows = [row for row in csv.DictReader(file) if row["train/loss"]]
+    rows = [row for row in read_rows(path) if row["train/loss"]]
     assert len(rows) == 3
     own = {"six_planes": "time_identity", "nine_planes": "smoothness"}[model]
-    names = ("colour", "histogram", "l_r", own)
+    others = ("train/loss", "train/psnr", "train/steps_skipped")
     for row in rows:
         terms = {
-            key: float(value)
+            key.partition("/")[2]: float(value)
             for key, value in row.items()
-            if key.startswith("train/")
-            and value
-            and key not in ("train/loss", "train/psnr", "train/steps_skipped")
+            if key.startswith("train/") and value and key not in others
         }
-        assert {f"train/{name}" for name in names} <= set(terms)
+        assert {"colour", "histogram", "l_r", own} <= set(terms)
         assert float(row["train/loss"]) == pytest.approx(sum(terms.values()), rel=1e-6)
-    assert (
-        float(rows[0]["train/l_r"])
-        > 1e-3
-        * decompose(sequence, method="admm", sparsity_weight=0.009, penalty=0.05)
-        .sparse.square()
-        .sum()
-        .item()
-    )
+    parts = decompose(sequence, method="admm", sparsity_weight=0.009, penalty=0.05)
+    assert float(rows[0]["train/l_r"]) > 1e-3 * parts.sparse.square().sum().item()
 
 
-NAMED = tuple(text for text in TINY if text != "lrm=none")
+def check_runs(folder: Path, *overrides: str) -> None:
+    """A few steps of the recipe, of the field that renders the fixed view too."""
+    named = (text for text in TINY if text != "lrm=none" and not text.startswith("data."))
+    config = changed(("recipe=paper", *named), "lrm=tiny", *overrides)
+    config["preparation"] |= {"cache": str(folder / "cache"), "frames": 3, "fixed_view_steps": 2}
+    config["trainer"]["max_steps"] = 2
+    run(config, folder / "run", [], resume=False)
+    told = metrics(folder / "run")
+    assert told["lrm"]["fixed_view"] == "3 frames rendered by kplanes trained for 2 steps"
+    assert told["step"] == 2
+    assert 0 < told["test"]["psnr"] < 60
 
 
 @pytest.mark.slow
 def test_it_runs_on_a_scene_off_centre(scenes, tmp_path, reduced):
-    given = "lrm=tiny", f"data.root={scenes}", "data=suite", "data.scene=off_centre"
-    check_runs(changed(("recipe=paper", *NAMED), *given), tmp_path)
+    sizes = (text for text in TINY if text.startswith("data."))
+    check_runs(tmp_path, *sizes, f"data.root={scenes}", "data=suite", "data.scene=off_centre")
 
 
 @pytest.mark.slow
 def test_it_runs_on_a_scene_of_d_nerf_three_times_as_large(scenes, tmp_path, reduced):
     ordinary = Experiment.read(small(f"data.root={scenes}")).data
     enlarge(ordinary.folder, tmp_path / "large", 3.0)
-    others = tuple(text for text in NAMED if not text.startswith("data."))
-    given = "lrm=tiny", "data=dnerf", f"data.root={tmp_path}", "data.scene=large"
-    check_runs(changed(("recipe=paper", *others), *given, "data.resolution=null"), tmp_path)
+    given = "data=dnerf", f"data.root={tmp_path}", "data.scene=large", "data.resolution=null"
+    check_runs(tmp_path, *given)
 
 
 @pytest.fixture
@@ -325,17 +278,6 @@ def reduced(monkeypatch) -> None:
         return compose_plain(name, [*lines, *KPLANES, *PROPOSAL])
 
     monkeypatch.setattr(fixed_view, "compose_plain", composed)
-
-
-def check_runs(config: dict, folder: Path) -> None:
-    """A few steps of the recipe, of the field that renders the fixed view too."""
-    config["preparation"] |= {"cache": str(folder / "cache"), "frames": 3, "fixed_view_steps": 2}
-    config["trainer"]["max_steps"] = 2
-    run(config, folder / "run", [], resume=False)
-    metrics = json.loads((folder / "run" / "metrics.json").read_text())
-    assert metrics["lrm"]["fixed_view"] == "3 frames rendered by kplanes trained for 2 steps"
-    assert metrics["step"] == 2
-    assert 0 < metrics["test"]["psnr"] < 60
 
 
 def enlarge(folder: Path, target: Path, factor: float) -> None:
@@ -357,16 +299,20 @@ def test_half_the_timesteps_are_rows_whatever_the_lrm_has():
     assert (default.rows_of_time(times, frames=16), default.rows_of_time(times)) == (16, 5)
 
 
-def test_its_conversion_keeps_the_middle_frame(tmp_path):
-    method = Experiment.read(small("model=nine_planes", "model.time_resolution=4")).method
-    sequence, device = moving_sequence(), torch.device("cpu")
-    cache = StageCache(tmp_path)
+@pytest.mark.parametrize("plane_set", ["six", "nine"])
+def test_its_conversion_keeps_the_middle_frame_and_time_planes_begin_as_k_planes_do(
+    tmp_path, plane_set
+):
+    method = Experiment.read(small(f"model={plane_set}_planes", "model.time_resolution=4")).method
+    sequence, device, cache = moving_sequence(), torch.device("cpu"), StageCache(tmp_path)
     parts = decompose_stage(sequence, method.decomposition, cache, device)
-    size = sequence.shape[-1]
+    channels, size = sequence.shape[2], sequence.shape[-1]
     settings = replace(method.model, resolution=size)
     stage = convert_stage(parts, settings, method.decomposition, 0, cache, device)
-    planes = named_planes(stage, "nine")
+    planes = named_planes(stage, plane_set)
     middle = parts.content["low_rank"][len(sequence) // 2]
     for index, name in enumerate(("xy", "xz", "yz")):
         torch.testing.assert_close(planes[name], middle[index], rtol=0, atol=0)
-    assert all((planes[name] == 1).all() for name in TIME_PLANES["nine"])
+    for name in TIME_PLANES[plane_set]:
+        assert planes[name].shape == (channels, 4, size)
+        assert (planes[name] == 1).all()

@@ -1,6 +1,7 @@
 """Settings and data that a resumed run must share with the original one."""
 
 import json
+import re
 import shutil
 import signal
 from dataclasses import fields, replace
@@ -11,7 +12,7 @@ import pytest
 import yaml
 from lightning.pytorch.callbacks import Callback
 
-from tests.training.runs import small_config
+from tests.training.runs import UNSCORED, metrics, small_config, status
 from xplanes.errors import ConfigError
 from xplanes.files import read_rows
 from xplanes.process import resume_command
@@ -24,99 +25,97 @@ from xplanes.training.checkpoints import AtomicCheckpointIO
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import KEPT, RunRecord, require_same_run
 
-FEW = ("trainer.max_steps=6", "callbacks.evaluation.at=[]")
+FEW = ("trainer.max_steps=6", UNSCORED)
 PAGES = ("config.yaml", "overrides.txt", "metrics.json")
 
 
+def written(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in PAGES}
+
+
 @pytest.fixture(scope="module")
-def trained(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "whole"
     run(small_config(scenes, *FEW), folder, ["seed=0"], resume=False)
     return folder
 
 
 @pytest.fixture
-def folder(trained: Path, tmp_path: Path) -> Path:
-    """A finished run of one's own."""
-    return Path(shutil.copytree(trained, tmp_path / "run"))
+def folder(whole: Path, tmp_path: Path) -> Path:
+    """A finished run of one's own, where `train` looks for it."""
+    return Path(shutil.copytree(whole, tmp_path / "run"))
 
 
-def note_checkpoints(written: list[tuple[str, dict]], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Note every checkpoint that is written, by the name of its file."""
+@pytest.fixture
+def saved(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict]]:
+    """Every checkpoint that is written, with the name of its file."""
+    noted = []
     save = AtomicCheckpointIO.save_checkpoint
 
     def note(self, checkpoint: dict, path: str, **options) -> None:
-        written.append((Path(path).name, checkpoint))
+        noted.append((Path(path).name, checkpoint))
         save(self, checkpoint, path, **options)
 
     monkeypatch.setattr(AtomicCheckpointIO, "save_checkpoint", note)
+    return noted
 
 
 def test_a_run_is_not_resumed_with_other_settings(scenes, folder):
-    before = {name: (folder / name).read_bytes() for name in PAGES}
+    before = written(folder)
     refused = {
         "model=nine_planes": r"model\.name=nine_planes: .* trained with model\.name=six_planes",
         "model.resolution=16": r"does not fit .*size mismatch for .* the run began with",
+        "trainer.max_steps=3": r"max_steps=3: .*has done 6 steps already",
     }
     for override, words in refused.items():
-        changed = small_config(scenes, *FEW, override)
         with pytest.raises(ConfigError, match=words):
-            run(changed, folder, ["seed=0", override], resume=True)
-        assert {name: (folder / name).read_bytes() for name in PAGES} == before, override
+            run(small_config(scenes, *FEW, override), folder, ["seed=0", override], resume=True)
+        assert written(folder) == before, override
     # The refusals leave a run that goes on as ever, with what may change.
     more = small_config(scenes, "trainer.max_steps=8", "model.plane_lr=0.01", "data.eval_views=2")
     run(more, folder, ["model.plane_lr=0.01"], resume=True)
     assert (folder / "overrides.txt").read_text() == "model.plane_lr=0.01\n"
-    metrics = json.loads((folder / "metrics.json").read_text())
-    assert (metrics["step"], len(metrics["views"])) == (8, 2)
+    assert (metrics(folder)["step"], len(metrics(folder)["views"])) == (8, 2)
 
 
-def test_a_run_is_not_resumed_with_other_images(scenes, folder):
-    record = json.loads((folder / "run.json").read_text())
+def test_a_run_is_not_resumed_with_other_images(train, folder):
+    record = status(folder)
     record["files"]["train"].reverse()
     (folder / "run.json").write_text(json.dumps(record))
     for _ in range(2):  # The first refusal forgets nothing.
         with pytest.raises(ConfigError, match=r"trained on 10 views, .* restore the scene's files"):
-            run(small_config(scenes, *FEW), folder, [], resume=True)
+            train(*FEW, resume=True)
 
 
-def test_the_best_is_chosen_by_the_same_views_throughout(scenes, tmp_path, monkeypatch):
+def test_the_best_is_chosen_by_the_same_views_throughout(train, monkeypatch, saved):
     """One view is scored on the way, and the others are harder by 10 dB."""
     original = scores.score_image
-    improved: list[tuple[str, dict]] = []
 
     def score(image, item):
         found = original(image, item)
         return replace(found, psnr=found.psnr - 10 * (item["index"] != 0))
 
     monkeypatch.setattr(scores, "score_image", score)
-    note_checkpoints(improved, monkeypatch)
-    few = (
-        "trainer.limit_val_batches=1",
-        "callbacks.evaluation.at=[0,0.5]",
-        "callbacks.checkpoints.every=99",
-    )
-    run(small_config(scenes, *few), tmp_path / "run", [], resume=False)
-    assert [state["global_step"] for name, state in improved if name == "best.ckpt"] == [20, 40]
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert len(metrics["views"]) == 3  # In the end all are looked at.
+    few = ("trainer.limit_val_batches=1", "callbacks.evaluation.at=[0,0.5]")
+    folder = train(*few, "callbacks.checkpoints.every=99")
+    assert [state["global_step"] for name, state in saved if name == "best.ckpt"] == [20, 40]
+    assert len(metrics(folder)["views"]) == 3  # In the end all are looked at.
 
 
-def test_no_checkpoint_between_the_batches_of_an_update(scenes, tmp_path, monkeypatch):
+def test_no_checkpoint_between_the_batches_of_an_update(train, saved):
     """A run that goes on from a checkpoint's step has written none for it yet."""
-    written: list[tuple[str, dict]] = []
     every = (*FEW, "trainer.accumulate_grad_batches=4", "callbacks.checkpoints.every=2")
-    folder = tmp_path / "run"
-    run(small_config(scenes, *every, "trainer.max_steps=2"), folder, [], resume=False)
-    note_checkpoints(written, monkeypatch)
-    run(small_config(scenes, *every, "trainer.max_steps=3"), folder, [], resume=True)
-    assert "resumed  after step 2, 0 s of training" in (folder / "train.log").read_text()
-    batches = [state["progress"]["batches"] for _, state in written]
+    train(*every, "trainer.max_steps=2")
+    saved.clear()
+    folder = train(*every, "trainer.max_steps=3", resume=True)
+    said = (folder / "train.log").read_text()
+    assert re.search(r"resumed  after step 2, \d+ s of training", said)
+    batches = [state["progress"]["batches"] for _, state in saved]
     assert batches[-1] == 12
     assert all(count % 4 == 0 for count in batches)
 
 
-def test_a_signal_after_the_last_step_is_heard(scenes, tmp_path, monkeypatch):
+def test_a_signal_after_the_last_step_is_heard(train, tmp_path, monkeypatch):
     finish = RadianceModule.on_train_end
 
     def press_ctrl_c(self) -> None:
@@ -125,11 +124,10 @@ def test_a_signal_after_the_last_step_is_heard(scenes, tmp_path, monkeypatch):
 
     monkeypatch.setattr(RadianceModule, "on_train_end", press_ctrl_c)
     with pytest.raises(KeyboardInterrupt):
-        run(small_config(scenes, *FEW), tmp_path / "run", [], resume=False)
-    assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "interrupted"
+        train(*FEW)
+    assert status(tmp_path / "run")["status"] == "interrupted"
     monkeypatch.undo()
-    run(small_config(scenes, *FEW), tmp_path / "run", [], resume=True)
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["step"] == 6
+    assert metrics(train(*FEW, resume=True))["step"] == 6
 
 
 class Fails(Callback):
@@ -140,15 +138,13 @@ class Fails(Callback):
             raise RuntimeError("a fault of one's own")
 
 
-def test_a_fault_of_ones_own_says_how_to_go_on(scenes, tmp_path, capsys):
-    config = small_config(scenes, *FEW, "media=false", "lrm=none", "trainer.max_steps=5")
-    config["callbacks"] |= {"fails": {"_target_": f"{__name__}.Fails"}}
-    config["plugins"] = [__name__]
+def test_a_fault_of_ones_own_says_how_to_go_on(scenes, train, tmp_path, capsys):
+    usual = small_config(scenes, *FEW)["callbacks"]
+    fails = usual | {"fails": {"_target_": f"{__name__}.Fails"}}
     with pytest.raises(RuntimeError, match="a fault of one's own"):
-        run(config, tmp_path / "run", [], resume=False)
+        train(*FEW, plugins=[__name__], callbacks=fails)
     assert f"Once that is fixed: {resume_command(tmp_path / 'run')}" in capsys.readouterr().out
-    config["callbacks"].pop("fails")
-    run(config, tmp_path / "run", [], resume=True)
+    train(*FEW, resume=True)
 
 
 def test_another_start_in_a_folder_begins_its_own_record(tmp_path):
@@ -191,40 +187,30 @@ def test_what_planes_and_frame_depend_on_is_kept(tmp_path):
             goes_on(without, that)
 
 
-def test_a_limit_that_a_run_has_passed_is_refused(scenes, folder):
-    before = (folder / "config.yaml").read_bytes()
-    with pytest.raises(ConfigError, match=r"max_steps=3: .*has done 6 steps already"):
-        run(small_config(scenes, *FEW, "trainer.max_steps=3"), folder, [], resume=True)
-    assert (folder / "config.yaml").read_bytes() == before
-
-
 @pytest.mark.parametrize(
     ("views", "missing", "scored"),
     [(10, ("val", "test"), 10), (20, ("val", "test"), 2), (10, ("val",), 3)],
 )
 def test_a_missing_split_is_held_out_of_training_or_nothing_is_the_best(
-    scenes, tmp_path, views, missing, scored
+    scenes, train, tmp_path, views, missing, scored
 ):
-    demo = small_config(scenes, *FEW, "callbacks.evaluation.at=[0]")
-    made = SceneDataModule(demo["data"])
-    folder = Path(shutil.copytree(made.settings.folder, tmp_path / "scenes" / "few"))
+    usual = small_config(scenes)["data"]
+    made = SceneDataModule(usual).settings.folder
+    folder = Path(shutil.copytree(made, tmp_path / "scenes" / "few"))
     index = folder / "transforms_train.json"
-    train = json.loads(index.read_text())
+    listed = json.loads(index.read_text())
     video = json.loads((folder / "transforms_video.json").read_text())["frames"]
-    train["frames"] += video[: views - len(train["frames"])]
-    index.write_text(json.dumps(train))
+    listed["frames"] += video[: views - len(listed["frames"])]
+    index.write_text(json.dumps(listed))
     for split in missing:
         (folder / f"transforms_{split}.json").unlink()
     known = {field.name for field in fields(BlenderSettings)}
-    data = {name: value for name, value in demo["data"].items() if name in known}
-    target = "xplanes.scenes.dnerf.BlenderSettings"
-    data |= {"_target_": target, "root": str(tmp_path / "scenes"), "scene": "few"}
-    data["mask_use"] = "auto"
-    done = tmp_path / "run"
-    run(demo | {"data": data}, done, [], resume=False)
-    metrics = json.loads((done / "metrics.json").read_text())
+    data = {name: value for name, value in usual.items() if name in known}
+    data |= {"_target_": "xplanes.scenes.dnerf.BlenderSettings", "mask_use": "auto"}
+    data |= {"root": str(tmp_path / "scenes"), "scene": "few"}
+    done = train(*FEW, "callbacks.evaluation.at=[0]", data=data)
     split = "val" if "test" in missing else "test"
-    assert (metrics["split"], len(metrics["views"])) == (split, scored)
+    assert (metrics(done)["split"], len(metrics(done)["views"])) == (split, scored)
     assert {row["split"] for row in read_rows(done / "curve.csv")} == {split}
     assert (done / "checkpoints" / "best.ckpt").is_file() == (split == "val")
     log = (done / "train.log").read_text()

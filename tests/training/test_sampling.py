@@ -1,9 +1,11 @@
 """Numbers of samples in training steps and in images."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
-from tests.training.runs import small_config
+from tests.training.runs import same_state, small_config
 from xplanes.errors import ConfigError
 from xplanes.models.initialisation import Method
 from xplanes.rendering import grid_renderer
@@ -19,11 +21,12 @@ def fog(points, times):
     return torch.ones_like(points), torch.ones_like(points[:, 0])
 
 
-@pytest.fixture
-def sampling(tmp_path) -> OccupancySampler:
-    config = small_config(tmp_path, "model.sampler.samples=15", "model.sampler.render_samples=40")
-    site = Site(cube_frame(1.0, torch.zeros(3)), times=torch.zeros(1), seed=0, precision="32")
-    return Method.read(config).model.sampler.build(fog, site)
+def sampler(field, *overrides: str, times=None, **site) -> OccupancySampler:
+    """What draws samples of a field of the whole cube."""
+    settings = Method.read(small_config(Path(), *overrides)).model.sampler
+    times = torch.zeros(1) if times is None else times
+    frame = cube_frame(1.0, torch.zeros(3))
+    return settings.build(field, Site(frame, times=times, seed=0, precision="32", **site))
 
 
 def along_the_diagonal() -> dict[str, torch.Tensor]:
@@ -37,7 +40,8 @@ def along_the_diagonal() -> dict[str, torch.Tensor]:
     }
 
 
-def test_images_of_the_trained_field_have_samples_of_their_own(sampling, monkeypatch):
+def test_images_of_the_trained_field_have_samples_of_their_own(monkeypatch):
+    sampling = sampler(fog, "model.sampler.samples=15", "model.sampler.render_samples=40")
     seen = sampling.renderer.render(fog, **along_the_diagonal())
     assert len(seen.samples) == STEPS_OF_A_RAY["training"]  # Nothing is pruned yet.
     monkeypatch.setattr(grid_renderer, "HALF_EMPTY", 1.0)
@@ -49,27 +53,22 @@ def test_images_of_the_trained_field_have_samples_of_their_own(sampling, monkeyp
     assert sampling.renderer.grid is sampling.grid
 
 
-def test_room_follows_the_samples_of_batches_and_pictures_need_none(tmp_path):
-    frame = cube_frame(1.0, torch.zeros(3))
-    options = {"times": torch.zeros(1), "seed": 0, "precision": "32"}
-    settings = Method.read(small_config(tmp_path)).model.sampler
-    sampling = settings.build(fog, Site(frame, **options, samples_per_batch=8192))
+def test_room_follows_the_samples_of_batches_and_pictures_need_none():
+    sampling = sampler(fog, samples_per_batch=8192)
     assert sampling._training.room == 10240
     for samples, room in ((3000, 4096), (1, 1024), (10**6, 10240)):
         sampling.expect(samples)
         assert sampling._training.room == room, samples
     assert sampling.renderer.room is None
-    assert settings.build(fog, Site(frame, **options))._training.room is None
+    assert sampler(fog)._training.room is None
 
 
-def test_no_samples_for_images_are_refused(tmp_path):
+def test_no_samples_for_images_are_refused():
     with pytest.raises(ConfigError, match=r"model\.sampler\.render_samples=0: must be above 0"):
-        Method.read(small_config(tmp_path, "model.sampler.render_samples=0"))
+        sampler(fog, "model.sampler.render_samples=0")
 
 
-def test_images_find_empty_space_that_the_grid_has_not_pruned_yet(tmp_path):
-    config = small_config(tmp_path, "model.sampler.grid_resolution=8", "model.sampler.samples=64")
-    site = Site(cube_frame(1.0, torch.zeros(3)), times=torch.rand(6), seed=0, precision="32")
+def test_images_find_empty_space_that_the_grid_has_not_pruned_yet():
     asked = []
 
     def half(points, times):
@@ -77,7 +76,8 @@ def test_images_find_empty_space_that_the_grid_has_not_pruned_yet(tmp_path):
         asked.append(points)
         return (0.5 + 0.5 * points).clamp(0, 1), 3.0 * (points[:, 0] < 0)
 
-    sampling = Method.read(config).model.sampler.build(half, site)
+    options = ("model.sampler.grid_resolution=8", "model.sampler.samples=64")
+    sampling = sampler(half, *options, times=torch.rand(6))
     before = {name: value.clone() for name, value in sampling.grid.named_buffers()}
     heights = torch.linspace(-0.9, 0.9, 8**3)
     origins = torch.stack([torch.full_like(heights, -3.0), heights, 0.3 * heights], dim=1)
@@ -89,25 +89,20 @@ def test_images_find_empty_space_that_the_grid_has_not_pruned_yet(tmp_path):
     few = sampling.renderer.image(half, *(ray[:20] for ray in rays), 0.4, torch.ones(3))
     alike = {name: value[:20] for name, value in found.items()}
     torch.testing.assert_close(few, alike, atol=1e-5, rtol=0)
-    asked.clear()
-    sampling.renderer.image(half, *(ray[:20] for ray in rays), 0.4, torch.ones(3))
     unsearched = sum(map(len, asked)) * len(heights) / 20
     assert 0.5 * unsearched < searched < 0.7 * unsearched
-    for name, value in sampling.grid.named_buffers():
-        assert torch.equal(value, before[name]), name
+    same_state(before, dict(sampling.grid.named_buffers()))
 
 
-def test_images_search_for_what_is_there_at_their_time(tmp_path):
-    config = small_config(tmp_path, "model.sampler.grid_resolution=16", "model.sampler.samples=64")
-    site = Site(cube_frame(1.0, torch.zeros(3)), times=torch.rand(6), seed=0, precision="32")
-
+def test_images_search_for_what_is_there_at_their_time():
     def passing(points, times):
         """A ball that crosses the cube, by a field without a snapshot."""
         centre = torch.stack([1.4 * times - 0.7, 0 * times, 0 * times], dim=1)
         near = (points - centre).norm(dim=1) < 0.25
         return 0.5 + 0.5 * points, 50.0 * near
 
-    sampling = Method.read(config).model.sampler.build(passing, site)
+    options = ("model.sampler.grid_resolution=16", "model.sampler.samples=64")
+    sampling = sampler(passing, *options, times=torch.rand(6))
     grid = torch.linspace(-0.95, 0.95, 32)
     y, x = torch.meshgrid(grid, grid, indexing="ij")
     origins = torch.stack([x, y, torch.full_like(x, 3.0)], dim=-1).view(-1, 3)

@@ -45,10 +45,9 @@ def scene(kind):
             if kind == "world":
                 behind = world(views.image_rays(index)[1]).view(24, 24, 3)
             clear = images[index, ..., 3] == 0
-            images[index, clear] = torch.cat(
-                [(255 * behind).to(torch.uint8), torch.full((24, 24, 1), 255, dtype=torch.uint8)],
-                dim=-1,
-            )[clear]
+            images[index, clear] = torch.nn.functional.pad(255 * behind, (0, 1), value=255)[
+                clear
+            ].byte()
         splits[split] = replace(views, images=images)
     return Scene("ball", splits)
 
@@ -57,6 +56,12 @@ def built(kind, *overrides):
     module = RadianceModule(small_config(Path(), "model.rays.per_batch=512", *overrides))
     module.build(scene(kind))
     return module
+
+
+def same_parameters(groups, parameters):
+    """Groups of the optimiser hold each parameter once."""
+    listed = [id(p) for group in groups for p in group["params"]]
+    assert sorted(listed) == sorted(map(id, parameters))
 
 
 def picture(module, kind="world"):
@@ -97,12 +102,9 @@ def test_a_world_gets_a_background_and_the_planes_are_initialised_as_ever():
         if name == "field.decoder.layers.3.bias":  # No colour that nears a white background.
             value = value - torch.tensor([0.0, 1.0, 1.0, 1.0])
         torch.testing.assert_close(value, with_.state_dict()[name])
-    groups = [*with_.model.groups(), *with_.sampler.groups()]
-    listed = [id(p) for group in groups for p in group["params"]]
-    assert sorted(listed) == sorted(id(p) for p in with_.parameters())
-    assert set(terms(with_, "world")) == {
-        "colour", "passing", "distortion", "unseen", "exposures",
-    }  # fmt: skip
+    same_parameters([*with_.model.groups(), *with_.sampler.groups()], with_.parameters())
+    expected = "colour passing distortion unseen exposures"
+    assert set(terms(with_, "world")) == set(expected.split())
 
 
 def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():
@@ -149,21 +151,15 @@ def test_rays_have_half_the_samples_until_the_grid_is_pruned(kind, pruned):
 
 @pytest.mark.parametrize("kind", ["world", "white"])
 def test_before_a_background_planes_are_less_smooth_in_time_and_cells_stay_longer(kind):
+    factor = "model.loss.time_factor_with_background=0.25"
     module = built(
-        kind,
-        "model.sampler.sweep_at=[20,40]",
-        "model.loss.time_factor_with_background=0.25",
-        "model.rays.match_exposure=false",
+        kind, factor, "model.sampler.sweep_at=[20,40]", "model.rays.match_exposure=false"
     )
-    loss, world = module.model.settings.loss, kind == "world"
-    used = module.model.weights
+    world, loss, used = kind == "world", module.model.settings.loss, module.model.weights
     for name in ("time_variation", "time_smoothness", "time_magnitude"):
         assert getattr(used, name) == getattr(loss, name) * (0.25 if world else 1)
     assert module.grid.decay == (0.9 if world else 0.6)
-    if world:
-        assert module.sampler.settings.sweep_at == [40]
-    else:
-        assert len(module.sampler.settings.sweep_at) == 2
+    assert module.sampler.settings.sweep_at == ([40] if world else [20, 40])
 
 
 @pytest.fixture(scope="module")
@@ -178,13 +174,10 @@ def trained(tmp_path_factory: pytest.TempPathFactory):
 
 def test_training_learns_what_lies_behind(trained):
     module, before, _ = trained
-    truth = scene("world").splits["train"].composite(0, torch.ones(3))
-    error, first = (
-        float((found["colour"] - truth).square().mean()) for found in (picture(module), before)
-    )
-    assert error < 0.7 * first
+    truth, found = scene("world").splits["train"].composite(0, torch.ones(3)), picture(module)
+    errors = [(each["colour"] - truth).square().mean() for each in (found, before)]
+    assert errors[0] < 0.7 * errors[1]
     # Light that passes the cube has the background's colour, in images as in training.
-    found = picture(module)
     rays = module.frame.rays(*scene("world").splits["train"].image_rays(0))
     with torch.no_grad():
         behind = background_colour(module.field.background, *rays).view(24, 24, 3)
@@ -225,11 +218,9 @@ def test_baselines_see_the_world_in_their_own_way(model):
     else:
         assert "contracted space" in module.field.outline
         assert rendering.samples.distances.max() > 10  # The cube ends at 6.
-    groups = [id(p) for group in module.model.groups() for p in group["params"]]
-    assert sorted(groups) == sorted(id(p) for p in module.field.parameters())
-    assert baseline(model, "alpha").field.outline in module.field.outline.replace(
-        " over contracted space", ""
-    )
+    same_parameters(module.model.groups(), module.field.parameters())
+    outline = module.field.outline.replace(" over contracted space", "")
+    assert baseline(model, "alpha").field.outline in outline
 
 
 @pytest.mark.slow

@@ -95,15 +95,9 @@ def test_rows_have_means_and_deviations_and_wait_for_all_runs(records, monkeypat
         seed = int(overrides[-1].removeprefix("seed="))
         folders.append(folder)
         seconds = {"prepare": {"fill": 1.0}, "train": 2.0, "total": 4.0}
-        metrics = {
-            "test": {"psnr": 20.0 + seed, "ssim": 0.5},
-            "seconds": seconds,
-            "step": 10,
-            "samples_per_ray": 3.0,
-            "skipped": {"empty": 0.5},
-            "parameters": 7,
-            "peak_memory_bytes": 1e9,
-        }
+        metrics = {"test": {"psnr": 20.0 + seed, "ssim": 0.5}, "seconds": seconds, "step": 10}
+        metrics |= {"samples_per_ray": 3.0, "skipped": {"empty": 0.5}, "parameters": 7}
+        metrics |= {"peak_memory_bytes": 1e9}
         curve = [{"seconds": f"{t}", "step": f"{t}", "psnr": f"{seed + t}"} for t in (0, 1)]
         return records.Measured(metrics, curve)
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import fields
+from graphlib import TopologicalSorter
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -65,6 +66,8 @@ KINDS = {
     "decomposition": DecompositionSettings,
 }
 """Groups of settings, and what their options are derived from."""
+
+SET = [option for option in OPTIONS if option[0] in KINDS]
 
 COMPOSITIONS = [
     # The groups that go with all others, as many options of them at once as there are.
@@ -288,14 +291,12 @@ def yaml_names(node, prefix=""):
 
 
 def test_yaml_files_set_every_field_of_their_class_and_no_other():
-    for group, name in OPTIONS:
-        if group not in KINDS:
-            continue
-        content = content_of(group, name)
+    for group, name in SET:
+        content, told = content_of(group, name), f"conf/{group}/{name}.yaml"
         cls = class_of(content)
-        assert issubclass(cls, KINDS[group]), f"conf/{group}/{name}.yaml"
-        assert not inspect.isabstract(cls), f"conf/{group}/{name}.yaml"
-        assert yaml_names(content) - {"_target_"} == names_of(cls), f"conf/{group}/{name}.yaml"
+        assert issubclass(cls, KINDS[group]), told
+        assert not inspect.isabstract(cls), told
+        assert yaml_names(content) - {"_target_"} == names_of(cls), told
 
 
 def locations(cls, prefix):
@@ -308,14 +309,14 @@ def locations(cls, prefix):
 
 
 def test_the_command_line_knows_all_settings_that_are_files_or_folders():
-    classes = {(g, class_of(content_of(g, name))) for g, name in OPTIONS if g in KINDS}
+    classes = {(group, class_of(content_of(group, name))) for group, name in SET}
     classes |= {("", PretrainingSettings)}
     found = {key for group, cls in classes for key in locations(cls, f"{group}.".lstrip("."))}
     assert found == {name for name in NAMES if name != "resume" and "hydra." not in name}
 
 
 def test_settings_have_no_defaults_beside_those_of_the_yaml_files():
-    classes = {class_of(content_of(*option)) for option in OPTIONS if option[0] in KINDS}
+    classes = {class_of(content_of(*option)) for option in SET}
     assert len(classes) > 15
     for cls in classes:
         given = {name for name, _ in inspect.getmembers(cls)} & names_of(cls)
@@ -323,17 +324,16 @@ def test_settings_have_no_defaults_beside_those_of_the_yaml_files():
 
 
 def test_other_yaml_files_set_what_their_classes_take():
-    for group, kind in (("trainer", Trainer), ("callbacks", Callback), ("logger", Logger)):
-        for name in [name for found, name in OPTIONS if found == group]:
-            content = content_of(group, name)
-            nodes = [content] if group == "trainer" else list(content.values())
-            for node in nodes:
-                cls, told = class_of(node), f"conf/{group}/{name}.yaml"
-                assert issubclass(cls, kind), told
-                taken = set(inspect.signature(cls).parameters)
-                if group == "trainer":
-                    taken |= set(inspect.signature(lightning.Trainer).parameters)
-                assert set(node) - {"_target_"} <= taken, told
+    kinds = {"trainer": Trainer, "callbacks": Callback, "logger": Logger}
+    for group, name in [option for option in OPTIONS if option[0] in kinds]:
+        content, told = content_of(group, name), f"conf/{group}/{name}.yaml"
+        for node in [content] if group == "trainer" else content.values():
+            cls = class_of(node)
+            assert issubclass(cls, kinds[group]), told
+            taken = set(inspect.signature(cls).parameters)
+            if group == "trainer":
+                taken |= set(inspect.signature(lightning.Trainer).parameters)
+            assert set(node) - {"_target_"} <= taken, told
 
 
 @functools.cache
@@ -360,13 +360,17 @@ def changed_value(plain, key, value):
     return plain
 
 
-def refusal(call, *arguments):
-    """What is said against it; None if nothing is."""
+def refused(key, value, call, *arguments):
+    """A call is refused by the full key and its value. Returns what is said."""
     try:
         call(*arguments)
     except ConfigError as error:
-        return str(error)
-    return None
+        said = str(error)
+    else:
+        raise AssertionError(f"{key}={value} is taken")
+    shown = value[0] if isinstance(value, list) and f"{key}={value}" not in said else value
+    assert said.startswith(f"{key}={shown}"), f"{key}={value}: {said}"
+    return said
 
 
 def parts(hint) -> tuple[list[Any], list[Range]]:
@@ -460,10 +464,7 @@ def test_values_that_cannot_work_are_refused_by_their_full_key(group):
         if not key.startswith(f"{group}."):
             continue
         node = changed_value(plain, key, value)[group]
-        said = refusal(build, node, KINDS[group], group)  # As Experiment.read does.
-        assert said is not None, f"{key}={value} is taken"
-        shown = value[0] if isinstance(value, list) and f"{key}={value}" not in said else value
-        assert said.startswith(f"{key}={shown}"), f"{key}={value}: {said}"
+        refused(key, value, build, node, KINDS[group], group)  # As Experiment.read does.
 
 
 @pytest.mark.parametrize("name", ["kplanes", "six_planes"])
@@ -487,11 +488,9 @@ OTHERS = [
 ]
 
 
-def test_other_values_that_cannot_work_are_refused_by_their_full_key():
-    for key, value in OTHERS:
-        said = refusal(Experiment.read, changed_value(plains()[0], key, value))
-        assert said is not None, f"{key}={value} is taken"
-        assert said.startswith(f"{key}={value}"), f"{key}={value}: {said}"
+@pytest.mark.parametrize(("key", "value"), OTHERS)
+def test_other_values_that_cannot_work_are_refused_by_their_full_key(key, value):
+    refused(key, value, Experiment.read, changed_value(plains()[0], key, value))
 
 
 TRAINING = [
@@ -507,45 +506,50 @@ TRAINING = [
 ]
 
 
-def test_values_with_which_nothing_trains_are_refused_by_their_full_key(tmp_path):
-    for key, value in TRAINING:
-        plain = changed_value(plains()[1], key, value)
-        said = refusal(lambda p=plain: Experiment.read(p).build_trainer(tmp_path))
-        assert said is not None, f"{key}={value} is taken"
-        assert said.startswith(f"{key}={value}"), f"{key}={value}: {said}"
+@pytest.mark.parametrize(("key", "value"), TRAINING)
+def test_values_with_which_nothing_trains_are_refused_by_their_full_key(key, value, tmp_path):
+    plain = changed_value(plains()[1], key, value)
+    refused(key, value, lambda: Experiment.read(plain).build_trainer(tmp_path))
+
+
+def test_what_lightning_refuses_is_said_in_its_words(tmp_path):
     plain = changed_value(plains()[1], "trainer.strategy", "bogus")
-    with pytest.raises(ConfigError, match=r"^trainer.*strategy='bogus'"):  # In Lightning's words.
+    with pytest.raises(ConfigError, match=r"^trainer.*strategy='bogus'"):
         Experiment.read(plain).build_trainer(tmp_path)
 
 
 def test_classes_that_may_not_stand_in_a_place_are_refused():
-    lrm = to_plain(composed())["lrm"]["_target_"]
-    for group in GROUPS:
+    for key in (f"{group}._target_" for group in GROUPS):
         for target in (Path.__module__ + ".Path", "xplanes.no.Such", "os.system", 3):
-            said = refusal(Experiment.read, changed_value(plains()[0], f"{group}._target_", target))
-            assert said is not None, f"{group}: {target}"
-            assert said.startswith(f"{group}._target_={target}"), said
-    said = refusal(Experiment.read, changed_value(plains()[0], "model._target_", lrm))
-    assert said is not None
+            refused(key, target, Experiment.read, changed_value(plains()[0], key, target))
+    key, lrm = "model._target_", plains()[0]["lrm"]["_target_"]
+    said = refused(key, lrm, Experiment.read, changed_value(plains()[0], key, lrm))
     assert "must be a class derived from xplanes.models.base.ModelSettings" in said
 
 
-def test_missing_and_unknown_keys_of_a_file_are_refused_by_their_full_key():
-    for key in ("model.resolution", "model.decoder.width", "model.sampler.samples", "data.scene"):
-        plain = node = copy.deepcopy(plains()[0])
-        *groups, last = key.split(".")
-        for group in groups:
-            node = node[group]
-        value = node.pop(last)
-        assert refusal(Experiment.read, plain) == f"{key}: it is not set"
-        node |= {last: value, f"{last}s_": value}
-        said = refusal(Experiment.read, plain)
-        assert said is not None
-        assert said.startswith(f"{key}s_: there is no such setting")
-        assert said.split("Did you mean ")[1].startswith(last)
-    for group in GROUPS:
-        plain = {name: node for name, node in plains()[0].items() if name != group}
-        assert group in str(refusal(Experiment.read, plain))
+KEYS = ("model.resolution", "model.decoder.width", "model.sampler.samples", "data.scene")
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_missing_and_unknown_keys_of_a_file_are_refused_by_their_full_key(key):
+    plain = node = copy.deepcopy(plains()[0])
+    *groups, last = key.split(".")
+    for group in groups:
+        node = node[group]
+    value = node.pop(last)
+    with pytest.raises(ConfigError, match=f"^{key}: it is not set$"):
+        Experiment.read(plain)
+    node |= {last: value, f"{last}s_": value}
+    words = f"^{key}s_: there is no such setting(.|\n)*Did you mean {last}"
+    with pytest.raises(ConfigError, match=words):
+        Experiment.read(plain)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_missing_group_is_named(group):
+    plain = {name: node for name, node in plains()[0].items() if name != group}
+    with pytest.raises(ConfigError, match=group):
+        Experiment.read(plain)
 
 
 def test_a_crop_and_padding_exclude_each_other():
@@ -697,13 +701,7 @@ def test_imports_only_point_up_the_list():
                 told = f"{module} imports {target}"
                 assert target in LEVEL, f"{told}, which has no place in the list"
                 assert LEVEL[target] <= LEVEL[own], f"{told}: that points down the list"
-
-
-def test_no_wing_is_imported_by_the_core_or_by_another():
-    for module, path in sources().items():
-        own = room(module)
-        found = {name for name in imported(path) if room(name) in set(WINGS) - {own}}
-        assert not found, f"{module} imports {found}"
+                assert target not in WINGS, f"{told}: that is a wing"
 
 
 @pytest.mark.slow
@@ -726,13 +724,12 @@ def test_the_core_runs_without_its_wings():
 
 def test_commands_of_a_wing_come_from_an_entry_point():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
-    entries = [
-        EntryPoint(name, value, "xplanes.commands").load()
-        for name, value in settings["xplanes.commands"].items()
-    ]
+    given = settings["xplanes.commands"].items()
+    entries = [EntryPoint(name, value, "xplanes.commands").load() for name, value in given]
+    bare, whole = build_parser().format_help(), build_parser(entries).format_help()
     for command in ("pretrain-lrm", "inspect", "view", "export", "table"):
-        assert not re.search(rf"\n    {command}\s", build_parser().format_help())
-        assert re.search(rf"\n    {command}\s", build_parser(entries).format_help())
+        assert not re.search(rf"\n    {command}\s", bare)
+        assert re.search(rf"\n    {command}\s", whole)
 
 
 def test_modules_that_have_moved_are_found():
@@ -751,27 +748,11 @@ def test_modules_that_have_moved_are_found():
 
 def test_no_module_needs_itself_to_be_imported():
     modules = {name.removesuffix(".__init__"): path for name, path in sources().items()}
-    needs = {}
+    order = TopologicalSorter()
     for name, path in modules.items():
         found = imported(path, functions=False)
-        needs[name] = {
-            target if target in modules else target.rpartition(".")[0] for target in found
-        } - {name}
-    done, open_now = set(), []
-
-    def visit(name):
-        if name in done or name not in modules:
-            return
-        assert name not in open_now, " -> ".join([*open_now, name])
-        open_now.append(name)
-        for target in sorted(needs[name]):
-            visit(target)
-        open_now.pop()
-        done.add(name)
-
-    for name in modules:
-        visit(name)
-    assert len(done) == len(modules)
+        order.add(name, *({t if t in modules else t.rpartition(".")[0] for t in found} - {name}))
+    assert set(modules) <= set(order.static_order())  # Which raises if there is a circle.
 
 
 HEAVY = ("torch", "numpy", "lightning", "hydra", "numba", "torchmetrics", "PIL")

@@ -153,36 +153,32 @@ def test_a_module_that_was_loaded_logs_as_a_fresh_one(scenes, tmp_path):
     assert [row["step"] for row in rows(tmp_path / "second") if row["train/loss"]] == ["3", "7"]
 
 
+CALLBACKS = "lightning.pytorch.callbacks"
+THEME = {"_target_": f"{CALLBACKS}.progress.rich_progress.X"}
+
+
 @pytest.mark.parametrize(
-    ("key", "node", "words"),
+    ("key", "name", "value", "words"),
     [
-        ("trainer", {"logger": False}, r"trainer\.logger=False: set logger=none"),
-        ("trainer", {"default_root_dir": "x"}, r"trainer\.default_root_dir=x: set hydra\.run\.dir"),
+        ("trainer", "logger", False, r"trainer\.logger=False: set logger=none"),
+        ("trainer", "default_root_dir", "x", r"trainer\.default_root_dir=x: set hydra\.run\.dir"),
         (
-            "callbacks",
-            {
-                "bar": {
-                    "_target_": "lightning.pytorch.callbacks.RichProgressBar",
-                    "theme": {"_target_": "lightning.pytorch.callbacks.progress.rich_progress.X"},
-                }
-            },
+            *("callbacks", "bar", {"_target_": f"{CALLBACKS}.RichProgressBar", "theme": THEME}),
             r"callbacks\.bar\.theme\._target_=.*plain values.*derive",
         ),
         (
-            "callbacks",
-            {
-                "stop": {
-                    "_target_": "lightning.pytorch.callbacks.EarlyStopping",
-                    "monitor": "val/pnsr",
-                }
-            },
+            *(
+                "callbacks",
+                "stop",
+                {"_target_": f"{CALLBACKS}.EarlyStopping", "monitor": "val/pnsr"},
+            ),
             r"callbacks: EarlyStopping.*val/pnsr",
         ),
     ],
 )
-def test_settings_that_were_ignored_are_refused(scenes, tmp_path, key, node, words):
+def test_settings_that_were_ignored_are_refused(scenes, tmp_path, key, name, value, words):
     config = small_config(scenes, "trainer.max_steps=4")
-    config[key] |= node
+    config[key][name] = value
     with pytest.raises(ConfigError, match=words):
         run(config, tmp_path / "run", [], resume=False)
 

@@ -183,25 +183,22 @@ def test_command_lines_without_a_job_are_hydras_and_load_nothing_heavy(tmp_path)
         assert code == int(refused), (arguments, printed)
 
 
-def test_misfits_of_the_trainer_are_said_with_a_message(scenes, tmp_path):
-    cases = [
-        ({"max_secnds": 3}, "trainer.max_secnds=3: Trainer has no such argument"),
-        ({"accelerator": "tpu"}, "trainer.accelerator=tpu: must be one of auto, cpu, gpu"),
-        ({"max_seconds": -1}, "trainer.max_seconds=-1: must be above 0"),
-    ]
-    for more, words in cases:
-        config = small_config(scenes)
-        config["trainer"] |= more
-        with pytest.raises(ConfigError) as caught:
-            run(config, tmp_path / f"run_{words[:12]}", [], resume=False)
-        assert words in str(caught.value), words
-        assert not (tmp_path / f"run_{words[:12]}").exists()
+MISFITS = (
+    ("trainer.max_secnds", 3, "Trainer has no such argument"),
+    ("trainer.accelerator", "tpu", "must be one of auto, cpu, gpu"),
+    ("trainer.max_seconds", -1, "must be above 0"),
+    ("logger.tensorboard.foo", 1, "TensorBoardLogger has no such argument"),
+)
 
 
-def test_an_unknown_argument_of_a_logger_is_refused_before_anything_is_written(scenes, tmp_path):
-    config = small_config(scenes, "logger=tensorboard")
-    config["logger"]["tensorboard"]["foo"] = 1
-    with pytest.raises(ConfigError, match=r"logger\.tensorboard\.foo=1: .* no such argument"):
+@pytest.mark.parametrize(("key", "value", "words"), MISFITS)
+def test_misfits_are_said_before_anything_is_written(key, value, words, scenes, tmp_path):
+    config = node = small_config(scenes, "logger=tensorboard")
+    *groups, last = key.split(".")
+    for group in groups:
+        node = node[group]
+    node[last] = value
+    with pytest.raises(ConfigError, match=f"{re.escape(key)}={value}: {words}"):
         run(config, tmp_path / "run", [], resume=False)
     assert not (tmp_path / "run").exists()
 
@@ -358,29 +355,23 @@ def test_a_run_says_at_its_ends_what_it_takes_and_what_comes_next(scenes, tmp_pa
     assert {"_hparams_/experiment", "_hparams_/session_start_info"} <= set(parts)
 
 
-def test_a_busy_machine_is_told_of_and_scoring_counts_its_views(
+def test_a_run_that_keeps_nothing_tells_of_a_busy_machine_and_offers_nothing(
     scenes, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(bar, "PIPED_SECONDS", 0.0)
     monkeypatch.setattr(report, "training_share", lambda trainer: 0.31)
     config = small_config(scenes, "trainer.max_steps=2", "logger=none")
+    config["callbacks"]["checkpoints"] = None
     run(config, tmp_path / "run", [], resume=False)
     shown = capsys.readouterr().out
     assert "scoring: 1 of 2 views" in shown
     assert "scoring: 3 of 3 views" in shown
     assert "warning  training got 0.3 s of CPU time a second: other programs" in shown
+    for words in ("last.ckpt", "resume=", "xplanes render", "tensorboard"):
+        assert words not in shown
 
 
 def test_a_launcher_that_is_not_installed_names_its_extra(monkeypatch):
     monkeypatch.setattr(config_module, "LAUNCHERS", ("absent",))
     assert "[sweep]" in near_names(["hydra/launcher=absent"])
     assert "[sweep]" not in near_names(["hydra/launcher=basci"])
-
-
-def test_nothing_is_offered_that_a_run_does_not_leave(scenes, tmp_path, capsys):
-    config = small_config(scenes, "trainer.max_steps=2", "logger=none")
-    config["callbacks"]["checkpoints"] = None
-    run(config, tmp_path / "run", [], resume=False)
-    shown = capsys.readouterr().out
-    for words in ("last.ckpt", "resume=", "xplanes render", "tensorboard"):
-        assert words not in shown

@@ -12,12 +12,7 @@ from unittest import mock
 import lightning
 import pytest
 import torch
-from lightning.pytorch.callbacks import (
-    Callback,
-    EMAWeightAveraging,
-    LearningRateMonitor,
-    ModelCheckpoint,
-)
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger
 
 from tests.training.runs import same_state, small_config
@@ -146,14 +141,8 @@ def test_a_resumed_fit_ends_with_the_same_numbers(config, tmp_path):
     path = tmp_path / "half.ckpt"
 
     def fit(checkpoint: Path | None = None, *callbacks: lightning.Callback) -> dict:
-        used = trainer(
-            tmp_path,
-            max_steps=23,
-            logger=False,
-            enable_checkpointing=False,
-            limit_val_batches=0,
-            callbacks=list(callbacks),
-        )
+        plain = {"logger": False, "enable_checkpointing": False, "limit_val_batches": 0}
+        used = trainer(tmp_path, max_steps=23, callbacks=list(callbacks), **plain)
         module = RadianceModule(config)
         used.fit(module, SceneDataModule(config["data"]), ckpt_path=checkpoint)
         assert used.global_step == 23
@@ -166,15 +155,11 @@ def test_a_resumed_fit_ends_with_the_same_numbers(config, tmp_path):
 def test_callbacks_that_watch_a_metric_see_every_evaluation(scenes, tmp_path):
     config = small_config(scenes, "trainer.max_steps=60", "callbacks.evaluation.at=[0,0.2,0.4,0.6]")
     watched = {"monitor": "val/psnr", "mode": "max"}
+    stop = {"_target_": f"{CALLBACKS}.EarlyStopping", "patience": 1, "min_delta": 99}
+    keep = {"_target_": f"{CALLBACKS}.ModelCheckpoint", "filename": "mine"}
     config["callbacks"] |= {
-        "stop": watched
-        | {"_target_": f"{CALLBACKS}.EarlyStopping", "patience": 1, "min_delta": 99},
-        "keep": watched
-        | {
-            "_target_": f"{CALLBACKS}.ModelCheckpoint",
-            "dirpath": str(tmp_path),
-            "filename": "mine",
-        },
+        "stop": watched | stop,
+        "keep": watched | keep | {"dirpath": str(tmp_path)},
     }
     run(config, tmp_path / "run", [], resume=False)
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
@@ -227,15 +212,8 @@ class Steps(lightning.Callback):
 def test_gradients_are_clipped_and_accumulated(config, tmp_path):
     """Regularisers count towards the norm, once for each update."""
     steps = Steps()
-    used = trainer(
-        tmp_path,
-        logger=False,
-        max_steps=4,
-        limit_val_batches=0,
-        gradient_clip_val=1e-3,
-        accumulate_grad_batches=2,
-        callbacks=[steps],
-    )
+    options = {"gradient_clip_val": 1e-3, "accumulate_grad_batches": 2, "callbacks": [steps]}
+    used = trainer(tmp_path, logger=False, max_steps=4, limit_val_batches=0, **options)
     module = RadianceModule(config)
     used.fit(module, SceneDataModule(config["data"]))
     assert (used.global_step, module.batches) == (4, 8)
@@ -260,23 +238,6 @@ def test_two_halves_of_a_batch_make_the_same_step_as_the_whole(config):
             (sum(terms.values()) / parts).backward()
         found.append(module.field.space.grad.clone())
     torch.testing.assert_close(found[0], found[1], rtol=1e-3, atol=1e-7)
-
-
-def test_an_average_of_weights_is_scored_and_kept(config, tmp_path):
-    """Without buffers: an averaged grid would never empty."""
-    average = EMAWeightAveraging(decay=0.9, use_buffers=False)
-    keep = ModelCheckpoint(tmp_path, filename="mean", save_on_exception=False)
-    used = trainer(tmp_path, max_steps=10, logger=False, callbacks=[average, keep])
-    module, data = RadianceModule(config), SceneDataModule(config["data"])
-    used.fit(module, data)
-    stored = torch.load(keep.best_model_path, weights_only=True)
-    assert not torch.equal(
-        stored["state_dict"]["field.space"], stored["current_model_state"]["field.space"]
-    )
-    again = RadianceModule.load_from_checkpoint(keep.best_model_path)
-    assert torch.equal(again.grid.occupied, module.grid.occupied)
-    scored = trainer(tmp_path, logger=False).validate(again, data, verbose=False)[0]
-    assert scored["val/psnr"] == pytest.approx(float(used.callback_metrics["val/psnr"]), abs=1e-3)
 
 
 def test_a_scene_without_a_test_split_is_tested_on_its_validation_views(config, tmp_path):
@@ -329,9 +290,8 @@ class Other(lightning.LightningModule):
 
 def test_the_data_serve_other_modules(config, tmp_path):
     module = Other()
-    trainer(tmp_path, logger=False, limit_val_batches=0).fit(
-        module, SceneDataModule(config["data"])
-    )
+    data = SceneDataModule(config["data"])
+    trainer(tmp_path, logger=False, limit_val_batches=0).fit(module, data)
     assert float(module.colour.min()) > 0.5  # Most of the images is white.
 
 
@@ -374,8 +334,13 @@ def test_the_page_on_your_own_trainer_runs(config, tmp_path, monkeypatch):
     names = execute("own_trainer.md", ".*?", config, short)
     assert names["trainer"].global_step == 12
     kept = torch.load(tmp_path / "checkpoints" / "best.ckpt", weights_only=True)
-    assert {"current_model_state", "averaging_state"} <= kept.keys()
-    same_state(kept["state_dict"], names["again"].state_dict())
+    averaged, last = kept["state_dict"], kept["current_model_state"]
+    assert not torch.equal(averaged["field.space"], last["field.space"])
+    assert torch.equal(averaged["grid.occupied"], last["grid.occupied"])
+    again = names["again"]
+    same_state(averaged, again.state_dict())
+    scored = trainer(tmp_path, logger=False).validate(again, names["data"], verbose=False)[0]
+    assert scored["val/psnr"] == pytest.approx(float(names["best"].best_model_score), abs=1e-3)
 
 
 def test_a_checkpoint_of_another_version_is_refused_with_its_number(fitted, tmp_path):
@@ -406,10 +371,9 @@ def test_plugins_of_the_docs_are_composed_and_loaded_again(config, tmp_path, mon
 
 
 def test_a_list_of_settings_is_refused():
-    with pytest.raises(ConfigError, match=r"^compose\(\['seed=1'\]\): takes settings one by one"):
-        RadianceModule.compose(["seed=1"])  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match=r"^compose\(\['seed=1'\]\): takes settings one by one"):
-        SceneDataModule.compose(["seed=1"])  # type: ignore[arg-type]
+    for kind in (RadianceModule, SceneDataModule):
+        with pytest.raises(ConfigError, match=r"^compose\(\['seed=1'\]\): takes settings one by"):
+            kind.compose(["seed=1"])  # type: ignore[arg-type]
 
 
 def test_processes_do_not_send_each_other_the_grid_before_each_step(config, tmp_path):

@@ -101,16 +101,17 @@ def test_the_device_refuses_what_a_gpu_refuses_and_counts_what_it_is_asked(fake_
     assert counts.operations.total() < 12  # Nothing was added since.
 
 
+def encoded(model, frames, cache, place):
+    return encode(model, "key", frames, square_crop(*frames.shape[1:3]), cache, place, batch=2)
+
+
 @pytest.mark.parametrize("name", SIDES)
-def test_an_lrm_encodes_there(fake_gpu, tmp_path, name):
-    frames = frames_of(3)
-    crop = square_crop(*frames.shape[1:3])
-    places = torch.device("cpu"), fake_gpu
-    found = [
-        encode(model_of(name), "key", frames, crop, StageCache(None), place, batch=2)
-        for place in places
-    ]
-    torch.testing.assert_close(found[1].triplanes, found[0].triplanes)
+def test_an_lrm_encodes_there(fake_gpu, name):
+    here, there = (
+        encoded(model_of(name), frames_of(3), StageCache(None), place)
+        for place in (torch.device("cpu"), fake_gpu)
+    )
+    torch.testing.assert_close(there.triplanes, here.triplanes)
 
 
 @pytest.mark.filterwarnings("ignore:robust PCA stopped")
@@ -294,11 +295,10 @@ def test_processes_that_share_a_run_end_in_time_however_short_their_epochs_are()
 
 def test_an_lrm_whose_frames_are_cached_stays_where_it_is(fake_gpu, tmp_path):
     model, frames, cache = model_of(), frames_of(2), StageCache(tmp_path)
-    crop = square_crop(*frames.shape[1:3])
-    first = encode(model, "key", frames, crop, cache, fake_gpu, batch=2)
+    first = encoded(model, frames, cache, fake_gpu)
     model = model_of()
     with fake_device.counted() as counts:
-        again = encode(model, "key", frames, crop, cache, fake_gpu, batch=2)
+        again = encoded(model, frames, cache, fake_gpu)
     assert counts.totals == (0, 0, 0)
     assert torch.equal(first.triplanes, again.triplanes)
 

@@ -10,7 +10,8 @@ import pytest
 import torch
 import yaml
 
-from tests.training.runs import metrics, small_config
+from tests.refusals import assert_refused
+from tests.training.runs import SMALL, metrics, small_config
 from xplanes import RadianceModule, SceneDataModule, __version__
 from xplanes.components import build, plugins
 from xplanes.config import compose_plain
@@ -54,11 +55,17 @@ def config(tmp_path: Path) -> dict:
     return found | {"losses": {"opacity": LOSS}, "plugins": ["tests.plugins"]}
 
 
+def psnr_at_the_ends(folder: Path) -> tuple[float, float]:
+    """PSNR before the first step, and at the end."""
+    curve = list(csv.DictReader((folder / "curve.csv").open()))
+    return float(curve[0]["psnr"]), float(curve[-1]["psnr"])
+
+
 def test_all_four_train_log_and_load_again(config, tmp_path):
     folder = tmp_path / "run"
     run(config, folder, [], resume=False)
-    curve = list(csv.DictReader((folder / "curve.csv").open()))
-    assert float(curve[-1]["psnr"]) > float(curve[0]["psnr"]) + 1
+    first, last = psnr_at_the_ends(folder)
+    assert last > first + 1
     logged = list(csv.DictReader((folder / "csv" / "metrics.csv").open()))
     opacity = [float(row["train/opacity"]) for row in logged if row.get("train/opacity")]
     assert opacity[0] > opacity[-1] > 0
@@ -75,14 +82,7 @@ def test_all_four_train_log_and_load_again(config, tmp_path):
 def test_a_recipe_reaches_a_model_of_ones_own_or_names_itself(tmp_path):
     group = tmp_path / "model"
     group.mkdir()
-    rays = dict.fromkeys(("per_batch", "samples_per_batch"), "auto")
-    rays |= {"background": "white", "skip_background": False}
-    rays |= {
-        "background_share": 0.2,
-        "background_jitter": 0.05,
-        "error_share": 0.0,
-        "match_exposure": False,
-    }
+    rays = compose_plain("train", [])["model"]["rays"]
     defaults = [{"sampler": "proposal"}, {"/lrm@_global_.lrm": "none"}, "_self_"]
     (group / "blob.yaml").write_text(yaml.safe_dump({"defaults": defaults, **BLOB, "rays": rays}))
     own = [f"hydra.searchpath=[file://{tmp_path}]", "plugins=[tests.plugins]", "model=blob"]
@@ -107,16 +107,17 @@ def test_a_run_of_somebody_else_names_no_classes_by_itself(config, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
-    with pytest.raises(ConfigError, match=r"model\._target_=tests.*plugins=\[MODULE\]"):
-        load_run(folder)
-    with pytest.raises(ConfigError, match=r"data\._target_=tests.*plugins=\[MODULE\]"):
-        SceneDataModule.from_run(folder)
     path = tmp_path / "theirs.ckpt"
     content = {"hyper_parameters": {"config": config}, "state_dict": {}}
     versions = {"pytorch-lightning_version": "2.6.4", "xplanes": __version__}
     torch.save(content | versions, path)
-    with pytest.raises(ConfigError, match=r"model\._target_=tests.*plugins=\[MODULE\]"):
-        RadianceModule.load_from_checkpoint(path)
+    for load, given, part in (
+        (load_run, folder, "model"),
+        (SceneDataModule.from_run, folder, "data"),
+        (RadianceModule.load_from_checkpoint, path, "model"),
+    ):
+        with pytest.raises(ConfigError, match=rf"{part}\._target_=tests.*plugins=\[MODULE\]"):
+            load(given)
 
 
 @pytest.mark.parametrize(
@@ -171,26 +172,11 @@ def example(
         (package / f"{name}.py").write_text(code)
         (folder / f"{name}.yaml").write_text(settings)
         monkeypatch.syspath_prepend(project)
-        return compose_plain(
-            "train",
-            [
-                f"hydra.searchpath=[file://{project}/conf]",
-                "plugins=[my_package]",
-                f"{group}={name}",
-                f"data.root={scenes}",
-                "data.resolution=32",
-                "data.train_views=10",
-                "data.test_views=3",
-                "data.val_views=2",
-                "model.rays.per_batch=256",
-                "model.sampler.grid_resolution=24",
-                "trainer.accelerator=cpu",
-                "trainer.max_seconds=null",
-                "callbacks.evaluation.at=[0]",
-                "media=false",
-                *changes,
-            ],
-        )
+        few = ("data.", "trainer.", "media", "model.rays.per_batch", "model.sampler.grid_res")
+        own = [f"hydra.searchpath=[file://{project}/conf]", "plugins=[my_package]"]
+        own += [f"{group}={name}", f"data.root={scenes}", "callbacks.evaluation.at=[0]"]
+        short = [text for text in SMALL if text.startswith(few) and "max_steps" not in text]
+        return compose_plain("train", [*own, *short, *changes])
 
     yield write
     for name in [name for name in sys.modules if name.split(".")[0] == "my_package"]:
@@ -203,11 +189,6 @@ def small_model(example: Callable[..., dict]) -> dict:
     return example("A model", "model", "mlp", "trainer.max_steps=60")
 
 
-def first_psnr(folder: Path) -> float:
-    """PSNR before the first step."""
-    return float(next(csv.DictReader((folder / "curve.csv").open()))["psnr"])
-
-
 def test_the_lrm_of_the_docs_initialises_a_field(example, tmp_path):
     changes = ("preparation.cache=null", "preparation.frames=4", "trainer.max_steps=2")
     own = example("A Large Reconstruction Model", "lrm", "cardboard", *changes)
@@ -218,14 +199,15 @@ def test_the_lrm_of_the_docs_initialises_a_field(example, tmp_path):
     assert (tmp_path / "own" / "media" / "fixed_view.png").is_file()
     random = compose_plain("train", ["lrm=none"])["lrm"]
     run(own | {"lrm": random}, tmp_path / "random", [], resume=False)
-    assert first_psnr(tmp_path / "own") > first_psnr(tmp_path / "random") + 1
+    own_psnr, random_psnr = (psnr_at_the_ends(tmp_path / name)[0] for name in ("own", "random"))
+    assert own_psnr > random_psnr + 1
 
 
 def test_the_model_of_the_docs_trains(small_model, tmp_path):
     assert small_model["lrm"]["name"] == "none"
     run(small_model, tmp_path / "run", [], resume=False)
-    curve = list(csv.DictReader((tmp_path / "run" / "curve.csv").open()))
-    assert float(curve[-1]["psnr"]) > float(curve[0]["psnr"]) + 1
+    first, last = psnr_at_the_ends(tmp_path / "run")
+    assert last > first + 1
     field = load_run(tmp_path / "run", plugins=["my_package"]).module.field
     assert (dict(field.planes), field.moves) == ({}, True)
     assert (field.precision, field.outline) == ("32", "MLPField")
@@ -250,39 +232,34 @@ def test_the_settings_of_the_docs_data_format_are_complete(scenes):
     assert len(scene.splits["train"]) == 6
 
 
-@pytest.mark.parametrize(
-    ("groups", "words"),
-    [
-        ([{"params": [], "lr": 0.1}], 'MLPModel.groups: a group lacks name; write {"params": '),
-        ([{"name": "mlp"}], "a group lacks params and lr; write"),
-        ([{"params": [], "lr": 0.1, "name": "mlp"}] * 2, "two groups have the name mlp"),
-        (
-            [{"params": [], "lr": 0.1, "name": "mlp", "learning_rate": 1}],
-            "Adam takes no 'learning_rate', which the group mlp has; it takes lr, betas",
-        ),
-        (
-            [{"params": [], "lr": 0.1, "name": "mlp"}],
-            "no group has layers.0.weight of MLPField, which would never be trained; add it",
-        ),
-    ],
+GROUP = {"params": [], "lr": 0.1, "name": "mlp"}
+
+GROUPS = (
+    ([{"params": [], "lr": 0.1}], 'MLPModel.groups: a group lacks name; write {"params": '),
+    ([{"name": "mlp"}], "a group lacks params and lr; write"),
+    ([GROUP] * 2, "two groups have the name mlp"),
+    (
+        [GROUP | {"learning_rate": 1}],
+        "Adam takes no 'learning_rate', which the group mlp has; it takes lr, betas",
+    ),
+    ([GROUP], "no group has layers.0.weight of MLPField, which would never be trained; add it"),
 )
-def test_groups_that_cannot_be_trained_are_refused_when_the_model_is_built(
-    small_model, groups, words
-):
-    module = RadianceModule(small_model, plugins=["my_package"])
+
+
+def test_models_that_cannot_be_trained_are_refused_when_they_are_built(small_model, monkeypatch):
     scene = SceneDataModule(small_model["data"]).scene
+
+    def build_one() -> None:
+        RadianceModule(small_model, plugins=["my_package"]).build(scene)
+
+    build_one()
     model = sys.modules["my_package.mlp"].MLPModel
-    model.groups = lambda self: [dict(group) for group in groups]
-    with pytest.raises(ConfigError, match=re.escape(words)):
-        module.build(scene)
-
-
-def test_a_field_of_another_class_is_refused(small_model):
-    module = RadianceModule(small_model, plugins=["my_package"])
-    scene = SceneDataModule(small_model["data"]).scene
-    sys.modules["my_package.mlp"].MLPModel.field = torch.nn.Linear(4, 4)
-    with pytest.raises(ConfigError, match=r"MLPModel\.field: Linear must be derived from .*Radia"):
-        module.build(scene)
+    for groups, words in GROUPS:
+        monkeypatch.setattr(model, "groups", lambda self, found=groups: [dict(g) for g in found])
+        assert_refused(ConfigError, re.escape(words), build_one, groups)
+    monkeypatch.setattr(model, "field", torch.nn.Linear(4, 4), raising=False)
+    words = "MLPModel.field: Linear must be derived from xplanes.fields.base.RadianceField"
+    assert_refused(ConfigError, re.escape(words), build_one, "a linear layer")
 
 
 def test_a_part_of_a_field_may_not_hide_behind_a_property():

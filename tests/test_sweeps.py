@@ -86,15 +86,13 @@ def test_sweeps_have_the_papers_scenes_and_rows():
 
 
 def test_published_resolutions_and_lrms_are_those_that_are_swept():
-    for name, table, key in (
-        ("tables2_3", "Table 3", "lrm"),
-        ("table4", "Table 4", "model.resolution"),
-    ):
+    swept = ("tables2_3", "Table 3", "lrm"), ("table4", "Table 4", "model.resolution")
+    for name, table, key in swept:
         found = jobs_of(f"sweep={name}")
         entries = [entry for entry in read_published() if entry["table"] == table]
-        column = key.split(".")[-1]
-        assert {entry[column] for entry in entries} == set(values_of(found, key))
-        assert {entry["model"] for entry in entries} == set(values_of(found, "model"))
+        for setting in (key, "model"):
+            shown = {entry[setting.split(".")[-1]] for entry in entries}
+            assert shown == set(values_of(found, setting)), (name, setting)
 
 
 @pytest.mark.slow
@@ -147,20 +145,11 @@ def cases() -> Iterator[tuple[str, ...]]:
 
 
 @pytest.mark.slow
-def test_jobs_build_and_do_a_step():
+def test_all_jobs_build_and_do_a_step():
     found = list(cases())
     assert len(found) > 60
-    does_a_step(found[::20])
-
-
-@pytest.mark.slow
-def test_all_jobs_build_and_do_a_step():
-    does_a_step(list(cases()))
-
-
-def does_a_step(chosen: list[tuple[str, ...]]) -> None:
     scene = ball_scene()
-    for overrides in chosen:
+    for overrides in found:
         experiment = Experiment.read(small(*overrides))
         module, batches = built(experiment.config, scene)
         rays, state = batches.draw(0), module.state
@@ -317,9 +306,8 @@ def test_a_sweep_says_how_long_it_takes_and_its_jobs_go_on(scenes, tmp_path):
         *("model.sampler.grid_resolution=12", "model.sampler.samples=32", "media=false"),
         *("logger=none", f"data.root={scenes}"),
     )
-    place = tmp_path / "sweep"
-    given = ("-m", "sweep=mine", f"hydra.searchpath=[file://{tmp_path / 'conf'}]", *tiny)
-    given = (*given, f"hydra.sweep.dir={place}")
+    place, conf = tmp_path / "sweep", f"hydra.searchpath=[file://{tmp_path / 'conf'}]"
+    given = ("-m", "sweep=mine", conf, *tiny, f"hydra.sweep.dir={place}")
     first = train(*given, "trainer.max_steps=2", cwd=tmp_path)
     assert first.stdout.startswith("2 runs, 4 steps in all")
     runs = sorted(place.glob("*/metrics.json"))

@@ -1,8 +1,8 @@
 """`python train.py` as a user types it."""
 
 import itertools
-import json
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -14,11 +14,12 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import OmegaConf
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
 
 from hydra_plugins.xplanes import file_name
 from tests import inside, warm
-from tests.training.runs import SMALL
+from tests.training.runs import SMALL, metrics, status
 from tests.warm import train
 from xplanes import SceneDataModule, launch
 from xplanes import run as whole_run
@@ -33,8 +34,18 @@ from xplanes.scenes.colmap import ColmapSettings
 ROOT = Path(__file__).resolve().parent.parent
 
 
+SHORT = (*(text for text in SMALL if "max_steps" not in text), "callbacks.evaluation.at=[]")
+"""Settings of a small run without its number of steps."""
+
+
+def with_hydra(*overrides: str) -> DictConfig:
+    """What the overrides compose to, Hydra's own settings included."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("train", list(overrides), return_hydra_config=True)
+
+
 def exact(folder: Path) -> tuple:
-    content = json.loads((folder / "metrics.json").read_text())
+    content = metrics(folder)
     return content["test"], content["views"], content["samples_per_ray"], content["skipped"]
 
 
@@ -58,10 +69,8 @@ REFUSED = (
 def test_settings_are_checked_before_the_run_directory_is_made(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for override in REFUSED:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            config = compose("train", [override], return_hydra_config=True)
         with pytest.raises(SystemExit) as caught:
-            SettingsCheck().on_run_start(config)
+            SettingsCheck().on_run_start(with_hydra(override))
         words = str(caught.value)
         assert words.startswith("error: "), words
         assert override.removeprefix("+").split("=")[0] in words, words
@@ -70,10 +79,8 @@ def test_settings_are_checked_before_the_run_directory_is_made(tmp_path, monkeyp
 
 
 def test_missing_scene_says_where_to_get_one(tmp_path):
-    folder = f"hydra.run.dir={tmp_path / 'run'}"
-    result = inside.train(
-        "data=dnerf", f"data.root={tmp_path}", "data.scene=nothing", folder, code=1
-    )
+    given = (f"data.root={tmp_path}", "data.scene=nothing", f"hydra.run.dir={tmp_path / 'run'}")
+    result = inside.train("data=dnerf", *given, code=1)
     assert str(tmp_path / "nothing") in result.stderr
     assert "data=demo" in result.stderr
 
@@ -113,8 +120,7 @@ def test_runs_in_folders_of_any_name_are_resumed(tmp_path):
     run.mkdir()
     (run / "overrides.txt").write_text("seed=3\n")
     for text in (f"resume={run}", f"resume='{run}'"):
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            config = compose("train", prepare([text]), return_hydra_config=True)
+        config = with_hydra(*prepare([text]))
         assert (config.resume, config.hydra.run.dir, config.seed) == (str(run), str(run), 3)
     assert shlex.split(resume_command(run))[-1] == f"resume={run}"
 
@@ -142,18 +148,20 @@ def test_a_sweep_does_not_take_other_jobs_for_its_own(tmp_path):
             launch._require_same_job(tmp_path, other)
 
 
-def test_what_hydra_knows_may_stand_in_settings(scenes, tmp_path):
+def test_what_hydra_knows_may_stand_in_settings_and_piped_output_is_plain(scenes, tmp_path):
     (tmp_path / "link").symlink_to(scenes)
+    run = tmp_path / "run"
     result = inside.train(
-        *(option for option in SMALL if not option.startswith("trainer.max_steps")),
-        *("trainer.max_steps=2", "callbacks.evaluation.at=[]"),
-        "data.root=${hydra:runtime.cwd}/link",
+        *(*SHORT, "trainer.max_steps=5", "data.root=${hydra:runtime.cwd}/link"),
         "+callbacks.keep._target_=lightning.pytorch.callbacks.ModelCheckpoint",
         "+callbacks.keep.dirpath=${hydra:runtime.output_dir}/mine",
-        f"hydra.run.dir={tmp_path / 'run'}",
+        f"hydra.run.dir={run}",
         cwd=tmp_path,
     )
-    assert "psnr" in result.stdout
+    assert not re.search("[\x1b\r]", result.stdout)
+    tail = result.stdout.split("step 5/5")[-1]
+    for words in ("psnr", "ssim", str(run)):
+        assert words in tail
 
 
 def test_a_group_set_to_null_is_answered_with_its_choices():
@@ -166,20 +174,17 @@ def test_a_run_goes_on_from_another_directory(scenes, tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
     (tmp_path / "a" / "scenes").symlink_to(scenes)
-    own = [option for option in SMALL if not option.startswith("trainer.max_steps")]
-    own += ["callbacks.evaluation.at=[]", "data.root=scenes"]
     run = tmp_path / "a" / "run"
-    inside.train(*own, "trainer.max_steps=2", f"hydra.run.dir={run}", cwd=tmp_path / "a")
+    given = (*SHORT, "data.root=scenes", "trainer.max_steps=2", f"hydra.run.dir={run}")
+    inside.train(*given, cwd=tmp_path / "a")
     inside.train(f"resume={run}", "trainer.max_steps=4", cwd=tmp_path / "b")
-    assert json.loads((run / "metrics.json").read_text())["step"] == 4
+    assert metrics(run)["step"] == 4
     assert not list((tmp_path / "b").iterdir())
 
 
 def test_a_stopped_sweep_says_how_the_whole_of_it_goes_on(tmp_path, monkeypatch, capsys):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        chosen = ["hydra.mode=MULTIRUN", f"hydra.sweep.dir={tmp_path}", "hydra.job.num=0"]
-        chosen += [f"hydra.runtime.output_dir={tmp_path}", "hydra.job.id=0"]
-        config = compose("train", chosen, return_hydra_config=True)
+    chosen = ["hydra.mode=MULTIRUN", f"hydra.sweep.dir={tmp_path}", "hydra.job.num=0"]
+    config = with_hydra(*chosen, f"hydra.runtime.output_dir={tmp_path}", "hydra.job.id=0")
 
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -197,17 +202,14 @@ def test_run_directories_have_names_that_need_no_quotes():
     scene, name = "/data/people/my scene (1)", "my-scene-1"
     names = {scene: name, **{same: same for same in ("lego", "..", "café", "null", ".5")}}
     assert {given: file_name(given) for given in names} == names
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        overrides = [f"data.scene={quoted(scene)}", "hydra.job.num=3"]
-        config = compose("train", overrides, return_hydra_config=True)
+    config = with_hydra(f"data.scene={quoted(scene)}", "hydra.job.num=3")
     assert config.hydra.run.dir.endswith(f"demo-{name}_six_planes_auto_s0")
     assert config.hydra.sweep.subdir == f"3_{name}_six_planes_auto_s0"
 
 
 def test_names_of_scenes_may_look_like_numbers():
     for name in ("2024_05_01", "1e3", "007"):
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            config = compose("train", prepare([f"data.scene={name}", f"data.root={name}"]))
+        config = with_hydra(*prepare([f"data.scene={name}", f"data.root={name}"]))
         assert (config.data.scene, config.data.root) == (name, name)
     assert prepare(["-m", "data.scene=001,lego,1_0"]) == ["-m", "data.scene='001',lego,'1_0'"]
     plain = ("data.scene=lego", "data.scene='1'", "seed=1_0", "data.scene=a,b")
@@ -226,12 +228,20 @@ HARD = (
 def test_any_path_can_be_given(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     given = prepare([f"{key}={name}" for key in ("data.root", "data.cache", "hydra.run.dir")])
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        given.append(with_names(f"resume={name}"))
-        config = compose("train", given, return_hydra_config=True)
-    found = config.data.root, config.data.cache, config.resume, config.hydra.run.dir
-    assert found == (name,) * 4
+    given.append(with_names(f"resume={name}"))
+    parse = OverridesParser.create().parse_override
+    assert [parse(text).value() for text in given] == [name] * 4
     assert unquoted(quoted(name)) == name
+
+
+def test_paths_arrive_in_the_configuration(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = ["it's", "a,b", "ends\\\\", "{x}"]
+    keys = ("data.root", "data.cache", "hydra.run.dir")
+    given = prepare([f"{key}={name}" for key, name in zip(keys, names, strict=False)])
+    config = with_hydra(*given, with_names(f"resume={names[-1]}"))
+    found = config.data.root, config.data.cache, config.hydra.run.dir, config.resume
+    assert found == tuple(names)
 
 
 def test_quotes_keep_any_text():
@@ -254,17 +264,6 @@ def test_home_is_expanded(monkeypatch, tmp_path):
     settings = build(plain, ColmapSettings, "data")
     assert settings.folder == tmp_path / "a b"
     assert (settings.masks, settings.times) == (f"{tmp_path}/m", f"{tmp_path}/t.csv")
-
-
-def test_piped_output_is_plain_and_ends_with_scores_and_paths(root, tmp_path):
-    run = tmp_path / "run"
-    result = inside.train(root, *SMALL, "trainer.max_steps=5", f"hydra.run.dir={run}")
-    assert "\x1b" not in result.stdout
-    assert "\r" not in result.stdout
-    tail = result.stdout.split("step 5/5")[-1]
-    assert "psnr" in tail
-    assert "ssim" in tail
-    assert str(run) in tail
 
 
 EACH_RANK = """
@@ -291,19 +290,12 @@ exec(compile(open({train!r}).read(), {train!r}, "exec"), globals())
 def test_two_processes_share_the_rays_and_end_with_one_model(tmp_path):
     root = f"data.root={tmp_path / 'scenes'}"  # Of videos that are as long as usual.
     run, script = tmp_path / "run", tmp_path / "each_rank.py"
-    script.write_text(
-        EACH_RANK.format(root=str(ROOT), train=str(ROOT / "train.py"), folder=str(tmp_path))
-    )
+    places = {"root": str(ROOT), "train": str(ROOT / "train.py"), "folder": str(tmp_path)}
+    script.write_text(EACH_RANK.format(**places))
 
     def train_both(*settings: str) -> None:
-        result = subprocess.run(
-            [sys.executable, str(script), *settings],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            timeout=240,
-            check=False,
-        )
+        command = [sys.executable, str(script), *settings]
+        result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240)
         assert result.returncode == 0, result.stderr
 
     # Between updates each process's grid sees its own samples.
@@ -320,10 +312,10 @@ def test_two_processes_share_the_rays_and_end_with_one_model(tmp_path):
     for name in first:
         assert torch.equal(first[name], second[name]), name
         assert torch.equal(first[name], state["state_dict"][name]), name
-    metrics = json.loads((run / "metrics.json").read_text())
+    found = metrics(run)
     rays = state["progress"]["counts"]["rays"]
     assert rays > 20 * 256  # Those of both.
-    assert metrics["rays_per_second"] == pytest.approx(rays / metrics["seconds"]["train"])
+    assert found["rays_per_second"] == pytest.approx(rays / found["seconds"]["train"])
     # From a step at which the grid is not updated, and before which it has met other samples.
     (tmp_path / "13.ckpt").replace(run / "checkpoints" / "last.ckpt")
     train_both(f"resume={run}")
@@ -338,16 +330,12 @@ def test_two_processes_stop_together_and_resume(tmp_path):
     root = f"data.root={tmp_path / 'scenes'}"  # Of videos that are as long as usual.
     run = tmp_path / "run"
     checkpoint = run / "checkpoints" / "last.ckpt"
+    command = [sys.executable, str(ROOT / "train.py"), root, *SMALL, "trainer=ddp"]
+    command += ["trainer.max_steps=100000", "callbacks.checkpoints.every=20"]
+    silent: dict = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
+    environment = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE"}
     process = subprocess.Popen(
-        [
-            *(sys.executable, str(ROOT / "train.py"), root, *SMALL, "trainer=ddp"),
-            *("trainer.max_steps=100000", "callbacks.checkpoints.every=20"),
-            f"hydra.run.dir={run}",
-        ],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "OMP_WAIT_POLICY": "PASSIVE"},
+        [*command, f"hydra.run.dir={run}"], cwd=ROOT, env=environment, **silent
     )
     try:
         warm.wait_for(checkpoint, process)
@@ -358,7 +346,7 @@ def test_two_processes_stop_together_and_resume(tmp_path):
         process.kill()
     assert checkpoint.stat().st_mtime_ns > before
     step = torch.load(checkpoint, weights_only=True)["global_step"]
-    assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
+    assert status(run)["status"] == "interrupted"
     train(f"resume={run}", f"trainer.max_steps={step + 5}")
     assert torch.load(checkpoint, weights_only=True)["global_step"] == step + 5
 
@@ -378,7 +366,7 @@ def test_a_run_is_alone_in_its_folder_and_ctrl_c_saves_it(root, tmp_path):
         alone_in(run).__enter__()
     process.send_signal(signal.SIGINT)
     assert process.wait(60) == 130
-    assert '"status": "interrupted"' in (run / "run.json").read_text()
+    assert status(run)["status"] == "interrupted"
     with alone_in(run):
         assert (run / ".lock").is_file()
 
@@ -415,7 +403,7 @@ def test_a_resumed_run_finds_groups_of_the_users_own_again(root, tmp_path):
     moved = "hydra.searchpath=[file:///elsewhere]"
     assert again[0] not in prepare([f"resume={run}", moved])
     train(f"resume={run}", "trainer.max_steps=3")
-    assert json.loads((run / "metrics.json").read_text())["step"] == 3
+    assert metrics(run)["step"] == 3
     assert path in (run / "overrides.txt").read_text().splitlines()
 
 
@@ -424,14 +412,9 @@ def test_a_field_renders_the_scene_inside_a_job(root, tmp_path):
     # That field's own settings are composed while Hydra's job is under way.
     folder = tmp_path / "run"
     result = train(
-        root,
-        *(line for line in SMALL if line not in ("lrm=none", "trainer.max_steps=40")),
-        "lrm=tiny",
-        "preparation.cache=null",
-        "preparation.fixed_view=train",
-        "preparation.fixed_view_steps=2",
-        "preparation.frames=3",
-        "trainer.max_steps=2",
+        *(root, *(text for text in SHORT if text != "lrm=none"), "lrm=tiny"),
+        *("preparation.cache=null", "preparation.fixed_view=train"),
+        *("preparation.fixed_view_steps=2", "preparation.frames=3", "trainer.max_steps=2"),
         f"hydra.run.dir={folder}",
     )
     assert "training six_planes for" in result.stdout

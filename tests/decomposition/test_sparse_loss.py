@@ -41,16 +41,12 @@ def full_sum(planes, sparse, plane_set):
     return total / sparse.numel()
 
 
-def test_all_frames_give_the_full_sum():
-    for plane_set, (resolution, rows) in itertools.product(
-        ["six", "nine"], [(6, 5), (9, 7), (4, 3)]
-    ):
-        case = f"plane_set={plane_set}, resolution={resolution}, rows={rows}"
-        planes, sparse = example(plane_set, resolution, rows)
-        value = sparse_product_loss(
-            planes, sparse, torch.arange(FRAMES), rows=PLANE_SETS[plane_set]
-        )
-        assert value == pytest.approx(full_sum(planes, sparse, plane_set).item(), rel=1e-10), case
+@pytest.mark.parametrize("plane_set", ["six", "nine"])
+@pytest.mark.parametrize(("resolution", "rows"), [(6, 5), (9, 7), (4, 3)])
+def test_all_frames_give_the_full_sum(plane_set, resolution, rows):
+    planes, sparse = example(plane_set, resolution, rows)
+    value = sparse_product_loss(planes, sparse, torch.arange(FRAMES), rows=PLANE_SETS[plane_set])
+    assert value == pytest.approx(full_sum(planes, sparse, plane_set).item(), rel=1e-10)
 
 
 def test_the_mean_over_all_draws_is_the_full_loss():
@@ -65,16 +61,12 @@ def test_the_mean_over_all_draws_is_the_full_loss():
         assert torch.stack(values).mean() == pytest.approx(full.item(), rel=1e-12), draws
 
 
-def test_gradients():
-    for plane_set in ["six", "nine"]:
-        planes, sparse = example(plane_set, resolution=4, rows=3)
-        loss = functools.partial(
-            sparse_product_loss,
-            sparse=sparse,
-            frames=torch.tensor([0, 3, 3]),
-            rows=PLANE_SETS[plane_set],
-        )
-        assert torch.autograd.gradcheck(loss, planes.requires_grad_()), plane_set
+@pytest.mark.parametrize("plane_set", ["six", "nine"])
+def test_gradients(plane_set):
+    planes, sparse = example(plane_set, resolution=4, rows=3)
+    options = {"frames": torch.tensor([0, 3, 3]), "rows": PLANE_SETS[plane_set]}
+    loss = functools.partial(sparse_product_loss, sparse=sparse, **options)
+    assert torch.autograd.gradcheck(loss, planes.requires_grad_())
 
 
 def test_one_frame_and_half_precision_targets():

@@ -41,31 +41,28 @@ def some_rays(count, seed=0):
     return origins, torch.nn.functional.normalize(target - origins, dim=1)
 
 
-def test_contraction_is_the_formula_and_keeps_the_unit_ball():
+@pytest.mark.parametrize(
+    ("function", "length"),
+    [
+        (contract, lambda points: points.norm(dim=-1)),
+        (contract_cube, lambda points: points.abs().amax(dim=-1)),
+    ],
+    ids=["ball", "cube"],
+)
+def test_contraction_is_the_formula_and_keeps_the_unit_ball_or_cube(function, length):
     generator = torch.Generator().manual_seed(0)
-    points = torch.randn(500, 3, generator=generator) * 10 ** (
-        6 * torch.rand(500, 1, generator=generator) - 3
-    )
-    found = contract(points)
-    expected = np.stack([contracted(point) for point in points.tolist()])
-    assert np.abs(found.numpy() - expected).max() < 5e-7
-    inside = points.norm(dim=1) < 0.999
-    assert inside.sum() > 50
-    assert torch.equal(found[inside], points[inside])
-    assert (found.norm(dim=1) < 2 + 1e-6).all()
-
-
-def test_contraction_to_a_cube_is_the_formula_and_keeps_the_unit_cube():
-    generator = torch.Generator().manual_seed(2)
-    points = torch.randn(500, 3, generator=generator) * 10 ** (
-        6 * torch.rand(500, 1, generator=generator) - 3
-    )
-    found = contract_cube(points)
-    expected = [contracted(point, lambda point: np.abs(point).max()) for point in points.tolist()]
+    sizes = 10 ** (6 * torch.rand(500, 1, generator=generator) - 3)
+    points = torch.randn(500, 3, generator=generator) * sizes
+    found = function(points)
+    expected = [
+        contracted(point, lambda point: float(length(torch.tensor(point))))
+        for point in points.double().numpy()
+    ]
     assert np.abs(found.numpy() - np.stack(expected)).max() < 5e-7
-    inside = points.abs().amax(dim=1) < 0.999
+    inside = length(points) < 0.999
     assert inside.sum() > 50
     assert torch.equal(found[inside], points[inside])
+    assert (length(found) < 2 + 1e-6).all()
 
 
 def exit_of(origin, direction):
@@ -141,18 +138,22 @@ def test_gradients_reach_the_background_and_are_zero_where_nothing_is_seen():
     assert all(p.grad is not None and not p.grad.any() for p in background.parameters())
 
 
+def optimizer_of(background):
+    planes = {"params": [background.planes], "lr": 0.2}
+    decoder = {"params": background.decoder.parameters(), "lr": 0.005}
+    return torch.optim.Adam([planes, decoder])
+
+
 def test_what_no_ray_has_crossed_keeps_the_initial_colour():
     usual = torch.tensor([0.6, 0.3, 0.2])
     with initial_values(3, Stream.BACKGROUND):
         background = Background(8, 32, width=32, samples=8, colour=usual)
-    origins, directions = some_rays(2000)
+    origins, directions = some_rays(600)
     origins, seen = 0.1 * origins, directions[:, 2] > 0
     with torch.no_grad():
         at_first = background_colour(background, origins, directions)
     assert (at_first - usual).abs().max() < 0.005
-    planes = {"params": [background.planes], "lr": 0.2}
-    decoder = {"params": background.decoder.parameters(), "lr": 0.005}
-    optimizer = torch.optim.Adam([planes, decoder])
+    optimizer = optimizer_of(background)
     for _ in range(40):
         optimizer.zero_grad()
         error = background_colour(background, origins[seen], directions[seen]) - usual
@@ -171,17 +172,13 @@ def test_darkest_and_brightest_initial_colours_can_be_left():
     assert (shown - torch.tensor([0.02, 0.98, 0.5])).abs().max() < 0.005
 
 
-def test_medians_count_weights():
+@pytest.mark.parametrize(
+    ("weights", "rows"), [([1.0, 1, 1, 0], (2, 2)), ([0.0, 1, 0, 2], (3, 3)), ([0.0] * 4, (1, 0))]
+)
+def test_medians_count_weights(weights, rows):
     values = torch.tensor([[3.0, 0.1], [1.0, 0.3], [2.0, 0.2], [9.0, 0.9]])
-    assert weighted_median(values, torch.tensor([1.0, 1.0, 1.0, 0.0])).tolist() == [
-        2.0,
-        values[2, 1],
-    ]
-    assert weighted_median(values, torch.tensor([0.0, 1.0, 0.0, 2.0])).tolist() == [
-        9.0,
-        values[3, 1],
-    ]
-    assert weighted_median(values, torch.zeros(4)).tolist() == [1.0, values[0, 1]]
+    found = weighted_median(values, torch.tensor(weights))
+    assert found.tolist() == [values[rows[0], 0], values[rows[1], 1]]
 
 
 def shown_elsewhere(weight):
@@ -190,22 +187,17 @@ def shown_elsewhere(weight):
         background = Background(8, 32, width=32, samples=8, colour=torch.tensor([0.6, 0.3, 0.2]))
     known = yaml.safe_load((CONF / "model" / "six_planes.yaml").read_text())["background"]
     settings = BackgroundSettings(**known | {"unseen": weight})
-    origins, directions = some_rays(2000)
+    origins, directions = some_rays(600)
     origins = 0.1 * origins
     bright, other = directions[:, 1] > 0.9, directions[:, 0] < -0.9
     seen = bright | (directions[:, 2] > 0.8)
     rays = {"target": 0.8 * bright[seen, None].float().expand(-1, 3)}
     rendering: Any = SimpleNamespace(opacity=torch.zeros(len(rays["target"])))
-    planes = {"params": [background.planes], "lr": 0.2}
-    decoder = {"params": background.decoder.parameters(), "lr": 0.005}
-    optimizer = torch.optim.Adam([planes, decoder])
+    optimizer = optimizer_of(background)
     for step in range(160):
         optimizer.zero_grad()
-        error = (
-            (background_colour(background, origins[seen], directions[seen]) - rays["target"])
-            .square()
-            .mean()
-        )
+        shown = background_colour(background, origins[seen], directions[seen])
+        error = (shown - rays["target"]).square().mean()
         terms = settings.losses(background, rendering, rays, TrainingState(0, step, step, 0))
         (error + sum(terms.values())).backward()
         optimizer.step()

@@ -1,6 +1,6 @@
 """Plane lookup: compiled loops, readable twin and NumPy oracle come to the same numbers."""
 
-import itertools
+import importlib.util
 
 import numpy as np
 import pytest
@@ -12,11 +12,31 @@ from tests.oracles import plane_features as oracle
 from xplanes.backend import threads
 from xplanes.fields import lookup
 from xplanes.fields import lookup_numba as cpu
-from xplanes.fields.lookup import add_plane_features, plane_features, plane_features_reference
+from xplanes.fields.lookup import (
+    add_plane_features,
+    plane_features,
+    plane_features_gpu,
+    plane_features_reference,
+)
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES
 
-SETS = ("three", "six", "nine")
 TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-13}
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def kernels(*given):
+    """The Triton kernels: on a GPU if there is one, else in triton's interpreter."""
+    *tensors, rows = given
+    there = (None if tensor is None else tensor.to(DEVICE) for tensor in tensors)
+    return plane_features_gpu(*there, rows).cpu()
+
+
+PLAIN = (plane_features, plane_features_reference)
+of_each = pytest.mark.parametrize(
+    "function", [*PLAIN, *([kernels] if importlib.util.find_spec("triton") else [])]
+)
+of_each_set = pytest.mark.parametrize("plane_set", PLANE_SETS)
+of_each_float = pytest.mark.parametrize("dtype", TOLERANCE)
 
 
 def stacks(plane_set, dtype=torch.float64, *, size=5, time_rows=4, time_size=7, channels=3, seed=0):
@@ -41,53 +61,37 @@ def scattered(count, dtype=torch.float64, seed=1, reach=1.4):
     return points, times
 
 
-def both(plane_set, space, time, points, times):
-    """Values and gradients of the compiled loops and of the readable twin."""
-    results = []
-    for function in (plane_features, plane_features_reference):
-        leaves = [p.clone().requires_grad_() for p in (space, time) if p is not None]
-        moving = leaves[1] if time is not None else None
-        value = function(leaves[0], moving, points, times, PLANE_SETS[plane_set])
-        upstream = torch.linspace(-1, 1, value.numel(), dtype=value.dtype).view_as(value)
-        gradients = torch.autograd.grad((value * upstream).sum(), leaves)
-        results.append((value.detach(), *gradients))
-    return results
+def outcome(function, plane_set, space, time, points, times):
+    """Values and gradients of the planes, with upstream gradients of the planes' precision."""
+    leaves = [p.clone().requires_grad_() for p in (space, time) if p is not None]
+    moving = leaves[1] if time is not None else None
+    value = function(leaves[0], moving, points, times, PLANE_SETS[plane_set])
+    upstream = torch.linspace(-1, 1, value.numel()).to(space.dtype).view_as(value)
+    gradients = torch.autograd.grad((value * upstream).sum(), leaves)
+    return [value.detach(), *gradients]
 
 
-def test_values_are_those_of_equation_15():
-    for dtype, plane_set in itertools.product([torch.float32, torch.float64], SETS):
-        case = f"dtype={dtype}, plane_set={plane_set}"
-        space, time = stacks(plane_set, dtype)
-        points, times = scattered(40, dtype)
-        expected = oracle(named(plane_set, space, time), plane_set, points, times)
-        for value, *_ in both(plane_set, space, time, points, times):
-            assert value.dtype == dtype, case
-            np.testing.assert_allclose(
-                value.numpy(), expected, atol=4 * TOLERANCE[dtype], err_msg=case
-            )
+def both(*given):
+    """What the compiled loops and the readable twin come to."""
+    return [outcome(function, *given) for function in PLAIN]
 
 
-def test_gradients_of_loops_and_twin_agree():
-    for dtype, plane_set in itertools.product([torch.float32, torch.float64], SETS):
-        case = f"dtype={dtype}, plane_set={plane_set}"
-        space, time = stacks(plane_set, dtype)
-        points, times = scattered(300, dtype)
-        compiled, reference = both(plane_set, space, time, points, times)
-        assert len(compiled) == (2 if plane_set == "three" else 3), case
-        for ours, theirs in zip(compiled, reference, strict=True):
-            assert ours.dtype == dtype, case
-            torch.testing.assert_close(
-                ours,
-                theirs,
-                atol=60 * TOLERANCE[dtype],
-                rtol=1e-5,
-                msg=lambda m, c=case: f"{c}: {m}",
-            )
-            assert theirs.abs().max() > 0.1, case
+@of_each_float
+@of_each_set
+def test_loops_and_twin_come_to_equation_15_and_to_the_same_gradients(dtype, plane_set):
+    space, time = stacks(plane_set, dtype)
+    points, times = scattered(40, dtype)
+    compiled, reference = both(plane_set, space, time, points, times)
+    expected = oracle(named(plane_set, space, time), plane_set, points, times)
+    for value in (compiled[0], reference[0]):
+        np.testing.assert_allclose(value, expected, atol=4 * TOLERANCE[dtype])
+    torch.testing.assert_close(compiled, reference, atol=60 * TOLERANCE[dtype], rtol=1e-5)
+    assert {found.dtype for found in (*compiled, *reference)} == {dtype}
+    assert all(found.abs().max() > 0.1 for found in reference)
 
 
 @pytest.mark.parametrize("asks", [(True, True), (True, False), (False, True)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@of_each_float
 def test_further_planes_are_added_to_the_first_channels(dtype, asks, monkeypatch):
     coarse, fine = stacks("three", dtype)[0], stacks("three", dtype, size=9, channels=2, seed=2)[0]
     points, times = scattered(300, dtype)
@@ -107,22 +111,19 @@ def test_further_planes_are_added_to_the_first_channels(dtype, asks, monkeypatch
     parts[0][..., :2] += parts[1]
     torch.testing.assert_close(compiled[0], parts[0], atol=4 * TOLERANCE[dtype], rtol=1e-5)
     monkeypatch.setattr(lookup, "cpu_loops", lambda planes: False)
-    for ours, theirs in zip(compiled, attempt(), strict=True):
-        torch.testing.assert_close(ours, theirs, atol=60 * TOLERANCE[dtype], rtol=1e-5)
-        assert theirs.abs().max() > 0.1
+    reference = attempt()
+    torch.testing.assert_close(compiled, reference, atol=60 * TOLERANCE[dtype], rtol=1e-5)
+    assert all(found.abs().max() > 0.1 for found in reference)
 
 
-def test_only_the_planes_that_ask_get_gradients():
-    space, time = stacks("six")
-    points, times = scattered(9)
-    for leaf in (space, time):
-        leaf.requires_grad_()
-        value = plane_features(space, time, points, times, PLANE_SETS["six"])
-        value.sum().backward()
-        assert leaf.grad is not None
-        assert (space.grad is None) == (leaf is not space)
-        assert (time.grad is None) == (leaf is not time)
-        leaf.requires_grad_(False).grad = None
+@of_each
+@pytest.mark.parametrize("asking", [0, 1], ids=["space", "time"])
+def test_only_the_planes_that_ask_get_gradients(function, asking):
+    planes = stacks("six", torch.float32)
+    planes[asking].requires_grad_()
+    function(*planes, *scattered(9, torch.float32), PLANE_SETS["six"]).sum().backward()
+    assert planes[asking].grad.abs().max() > 0
+    assert planes[1 - asking].grad is None
 
 
 def test_texel_centres_return_the_texels():
@@ -140,24 +141,23 @@ def test_texel_centres_return_the_texels():
     torch.testing.assert_close(moving[:, 0], time[0, step, step] * time[1, step, 4 - step])
 
 
-def test_infinite_points_are_outside_and_nan_stays_nan():
-    for dtype in [torch.float32, torch.float64]:
-        space, time = stacks("six", dtype)
-        points = torch.zeros(6, 3, dtype=dtype)
-        for place, bad in enumerate([torch.inf, -torch.inf, torch.nan, 3e38, -3e38]):
-            points[place, 0] = bad
-        times = torch.full((6,), 0.4, dtype=dtype)
-        times[5] = torch.nan
-        for value, *_ in both("six", space, time, points, times):
-            untouched = [0, 1, 3, 4]
-            assert (value[untouched, :2] == 0).all(), dtype  # xy and xz see x; yz does not
-            assert value[untouched, 2].isfinite().all(), dtype
-            assert value[2, :2].isnan().all(), dtype
-            assert value[2, 2].isfinite().all(), dtype
-            assert value[5].isnan().all(), dtype
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")  # The interpreter's, on purpose.
+@of_each
+@of_each_float
+def test_infinite_points_are_outside_and_nan_stays_nan(function, dtype):
+    points, times = torch.zeros(6, 3, dtype=dtype), torch.full((6,), 0.4, dtype=dtype)
+    points[:5, 0] = torch.tensor([torch.inf, -torch.inf, torch.nan, 3e38, -3e38])
+    times[5] = torch.nan
+    value = function(*stacks("six", dtype), points, times, PLANE_SETS["six"])
+    untouched = [0, 1, 3, 4]
+    assert (value[untouched, :2] == 0).all()  # xy and xz see x; yz does not
+    assert value[untouched, 2].isfinite().all()
+    assert value[2, :2].isnan().all()
+    assert value[2, 2].isfinite().all()
+    assert value[5].isnan().all()
 
 
-@pytest.mark.parametrize("plane_set", SETS)
+@of_each_set
 def test_results_are_the_same_bits_however_many_tasks_share_a_plane(monkeypatch, plane_set):
     found = []
     for tasks, count in ((1, 1), (2, 2), (4, 2), (32, 1)):
@@ -167,8 +167,7 @@ def test_results_are_the_same_bits_however_many_tasks_share_a_plane(monkeypatch,
             found.append(both(plane_set, *given, *scattered(5000, torch.float32)))
     for loops, twin in found:
         assert all(map(torch.equal, loops, found[0][0]))
-        for ours, theirs in zip(loops, twin, strict=True):
-            torch.testing.assert_close(ours, theirs, atol=1e-3, rtol=1e-4)
+        torch.testing.assert_close(loops, twin, atol=1e-3, rtol=1e-4)
 
 
 def test_each_thread_has_a_task(monkeypatch):
@@ -192,5 +191,4 @@ def test_any_point_of_any_resolution(size, rows, time_size, point, time):
     found = both("nine", space, moving, points, times)
     for value, *_ in found:
         np.testing.assert_allclose(value.numpy(), expected, atol=1e-12)
-    for ours, theirs in zip(*found, strict=True):
-        torch.testing.assert_close(ours, theirs, atol=1e-12, rtol=0)
+    torch.testing.assert_close(*found, atol=1e-12, rtol=0)

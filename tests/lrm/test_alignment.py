@@ -100,17 +100,18 @@ def test_crop_moves_the_centre_to_its_middle():
     assert alignment.frame.scale == pytest.approx(1.9 * share / 4.03 / TRIPOSR_VIEW.focal)
 
 
-def test_wrong_cameras_are_refused():
-    pose = random_pose(4)
-    options = {"height": 400, "width": 400, "view": OPENLRM_VIEW}
-    with pytest.raises(LRMError, match="behind the source camera"):
-        align(pose, focal=500, target=2 * pose[:3, 3], **options)
-    with pytest.raises(LRMError, match="too short"):
-        align(pose, focal=100, target=torch.zeros(3), **options)
-    with pytest.raises(LRMError, match="pad"):
-        align(
-            pose, focal=500, target=torch.zeros(3), matching="pad", crop=Crop(0, 0, 10), **options
-        )
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"focal": 500, "target": 2 * random_pose(4)[:3, 3]}, "behind the source camera"),
+        ({"focal": 100}, "too short"),
+        ({"focal": 500, "matching": "pad", "crop": Crop(0, 0, 10)}, "pad"),
+    ],
+)
+def test_wrong_cameras_are_refused(options, words):
+    given = {"height": 400, "width": 400, "view": OPENLRM_VIEW, "target": torch.zeros(3)}
+    with pytest.raises(LRMError, match=words):
+        align(random_pose(4), **given | options)
 
 
 def test_published_normalisation_of_poses_is_a_special_case():
@@ -118,14 +119,9 @@ def test_published_normalisation_of_poses_is_a_special_case():
     poses = torch.eye(4).repeat(4, 1, 1)
     poses[:, :3] = truth["poses"]
     for kind, distance in (("auto", 2.3), ("dist2", 2.0)):
-        alignment = align(
-            poses[0],
-            focal=300,
-            height=400,
-            width=400,
-            target=poses[0, :3, 3] - distance * poses[0, :3, 2],
-            view=replace(OPENLRM_VIEW, distance=distance),
-        )
+        target = poses[0, :3, 3] - distance * poses[0, :3, 2]
+        options = {"target": target, "view": replace(OPENLRM_VIEW, distance=distance)}
+        alignment = align(poses[0], focal=300, height=400, width=400, **options)
         assert alignment.frame.scale == pytest.approx(1), kind
         for pose, expected in zip(poses, truth[f"normalized_{kind}"], strict=True):
             compare(transformed(alignment.frame, pose)[:3], expected, atol=2e-6, case=kind)
@@ -140,11 +136,15 @@ def source_rays(view, seed=5, depth=4.03):
     focal = view.focal * SIZE
     target = pose[:3, 3] - depth * pose[:3, 2]
     alignment = align(pose, focal=focal, height=SIZE, width=SIZE, target=target, view=view)
-    rows, columns = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
-    rays = cast_rays(
-        pose, rows.flatten(), columns.flatten(), focal=focal, centre=(0.5 * SIZE, 0.5 * SIZE)
+    return alignment, rays_of(pose, focal)
+
+
+def rays_of(pose, focal):
+    """A ray through the middle of each pixel."""
+    rows, columns = (
+        axis.flatten() for axis in torch.meshgrid(*[torch.arange(SIZE)] * 2, indexing="ij")
     )
-    return alignment, rays
+    return cast_rays(pose, rows, columns, focal=focal, centre=(0.5 * SIZE, 0.5 * SIZE))
 
 
 def field_image(model, triplane, alignment, rays, samples=2000):
@@ -188,14 +188,7 @@ def test_triposr_image_through_our_field(monkeypatch):
     triplane = arrays("triposr_tiny/render.npz")["scene_code"]
     alignment, rays = source_rays(model.view)
     pose = model.view.camera_to_world().float()
-    rows, columns = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
-    origins, directions = cast_rays(
-        pose,
-        rows.flatten(),
-        columns.flatten(),
-        focal=model.view.focal * SIZE,
-        centre=(0.5 * SIZE, 0.5 * SIZE),
-    )
+    origins, directions = rays_of(pose, model.view.focal * SIZE)
     query = triposr_query(model, triplane)
     found = field_image(model, triplane, alignment, rays, samples=8000)
     published = triposr_oracle.render(query, origins, directions, samples=2000)

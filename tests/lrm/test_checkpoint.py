@@ -2,9 +2,6 @@
 
 import json
 import pickle
-from itertools import product
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pytest
 import torch
@@ -12,6 +9,7 @@ from safetensors.torch import save_file
 
 from tests.lrm.reduced import CONFIGS, SIDES, published_shapes, random_state, reduced
 from tests.lrm.reference import FOLDER, VERSIONS, compare, config
+from tests.training.runs import same_state
 from xplanes.lrm import LRM, LRMError, load
 from xplanes.lrm.checkpoint import build, fill, mismatches
 from xplanes.lrm.config import PUBLISHED, parse_config, published_config
@@ -27,30 +25,26 @@ def save(path, state):
     return path
 
 
-FILES = ["model.safetensors", "pytorch_model.bin", "model.ckpt"]
-
-
 @pytest.fixture(scope="module")
-def models():
+def models(tmp_path_factory):
     """A reduced model of each family, loaded from a file."""
-    with TemporaryDirectory() as folder:
-        return {
-            name: load(settings, save(Path(folder) / f"{name}.safetensors", state))
-            for name, (settings, state) in ((name, reduced(name)) for name in FAMILIES)
-        }
+    folder, given = tmp_path_factory.mktemp("models"), {name: reduced(name) for name in FAMILIES}
+    return {
+        name: load(settings, save(folder / f"{name}.safetensors", state))
+        for name, (settings, state) in given.items()
+    }
 
 
-def test_every_published_form_of_file_loads(tmp_path):
-    for name, file in product(FAMILIES, FILES):
-        case = f"{name} from {file}"
-        settings, state = reduced(name)
-        model = load(settings, save(tmp_path / file, state))
-        assert isinstance(model, LRM), case
-        assert model.config.architecture == name, case
-        assert not model.training, case
-        assert not any(p.is_meta or p.requires_grad for p in model.parameters()), case
-        parameters = sum(p.numel() for p in model.parameters())
-        assert parameters == sum(t.numel() for t in state.values()), case
+@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("file", ["model.safetensors", "pytorch_model.bin", "model.ckpt"])
+def test_every_published_form_of_file_loads(tmp_path, name, file):
+    settings, state = reduced(name)
+    model = load(settings, save(tmp_path / file, state))
+    assert isinstance(model, LRM)
+    assert model.config.architecture == name
+    assert not model.training
+    assert not any(p.is_meta or p.requires_grad for p in model.parameters())
+    assert sum(p.numel() for p in model.parameters()) == sum(t.numel() for t in state.values())
 
 
 def test_encode_and_decode(models):
@@ -106,35 +100,34 @@ def test_triposr_takes_no_camera_and_any_size(models):
         model.encode(torch.rand(1, 3, 64, 64), torch.zeros(1, 16))
 
 
-def test_each_tensor_is_needed_and_none_is_superfluous():
-    for name in FAMILIES:
-        settings, state = reduced(name)
-        model = build(parse_config(settings))
-        assert mismatches(model, state) == [], name
-        for key in state:
-            rest = {other: tensor for other, tensor in state.items() if other != key}
-            assert "lacks" in mismatches(model, rest)[0], f"{name}: {key}"
-        strange = {**state, "encoder.model.mask_token": torch.zeros(1)}
-        assert "unknown" in mismatches(model, strange)[0], name
-        for key, tensor in state.items():
-            problem = mismatches(model, {**state, key: tensor.new_zeros(*tensor.shape, 1)})[0]
-            assert problem.startswith(f"{key} is ["), name
+@pytest.mark.parametrize("name", FAMILIES)
+def test_each_tensor_is_needed_and_has_one_shape(name):
+    settings, state = reduced(name)
+    model = build(parse_config(settings))
+    assert mismatches(model, state) == []
+    for key, tensor in state.items():
+        rest = {other: value for other, value in state.items() if other != key}
+        assert "lacks" in mismatches(model, rest)[0], key
+        problem = mismatches(model, {**state, key: tensor.new_zeros(*tensor.shape, 1)})[0]
+        assert problem.startswith(f"{key} is ["), key
 
 
-def test_the_same_weights_twice_are_refused():
-    settings, state = reduced("openlrm-1.1")
-    twice = {**state, "transformer.layers.0.cross_attn.q_proj_weight": torch.zeros(32, 32)}
-    assert "unknown" in mismatches(build(parse_config(settings)), twice)[0]
+MORE = (
+    *((name, {"encoder.model.mask_token": torch.zeros(1)}, "unknown") for name in FAMILIES),
+    # The same weights twice.
+    ("openlrm-1.1", {"transformer.layers.0.cross_attn.q_proj_weight": torch.zeros(32, 32)}, "unkn"),
+    # Only the unused pooler is passed over.
+    ("triposr", {"image_tokenizer.model.pooler.weight": torch.zeros(2, 2)}, "unknown"),
+    ("triposr", {"image_tokenizer.model.pooler.dense.weight": torch.zeros(2, 2)}, ""),
+    ("triposr", {"image_tokenizer.model.pooler.dense.bias": torch.zeros(2, 2)}, ""),
+)
 
 
-def test_only_the_unused_pooler_is_passed_over():
-    settings, state = reduced("triposr")
-    pooler = {
-        f"image_tokenizer.model.pooler.dense.{p}": torch.zeros(2, 2) for p in ("weight", "bias")
-    }
-    assert mismatches(build(parse_config(settings)), {**state, **pooler}) == []
-    other = {"image_tokenizer.model.pooler.weight": torch.zeros(2, 2)}
-    assert "unknown" in mismatches(build(parse_config(settings)), {**state, **other})[0]
+@pytest.mark.parametrize(("name", "more", "words"), MORE)
+def test_no_tensor_is_superfluous_but_the_unused_pooler(name, more, words):
+    settings, state = reduced(name)
+    found = mismatches(build(parse_config(settings)), {**state, **more})
+    assert words in found[0] if words else found == []
 
 
 LISTINGS = {
@@ -170,10 +163,7 @@ def test_pickled_and_safetensors_weights_load_alike(tmp_path):
         state = content.get("weights", content)
         copy = save(tmp_path / "model.safetensors", {k: v.contiguous() for k, v in state.items()})
         second = load(config(folder), copy)
-        for (name, one), (_, other) in zip(
-            first.state_dict().items(), second.state_dict().items(), strict=True
-        ):
-            assert torch.equal(one, other), f"{folder}: {name}"
+        same_state(first.state_dict(), second.state_dict())
 
 
 def test_configuration_inside_the_file_wins_for_a_published_name(tmp_path):
@@ -201,41 +191,46 @@ class Intruder:
         return print, ("code was run",)
 
 
-def test_pickled_code_is_never_run(tmp_path, capsys):
+CONTENTS = (
+    *(
+        (content, "no named weights")
+        for content in ({"step": 3}, [1, 2], {}, {"weights": {"a": 1}})
+    ),
+    ({"weights": Intruder()}, "never run"),
+    (pickle.dumps(Intruder(), protocol=2), "never run"),
+    *(
+        (content, r"model\.ckpt")
+        for content in (b"error", b"\x80\x02" + bytes(range(256)), bytes(64))
+    ),
+)
+
+
+@pytest.mark.parametrize(("content", "words"), CONTENTS, ids=lambda given: repr(given)[:30])
+def test_files_without_weights_are_refused_and_no_code_of_theirs_is_run(
+    tmp_path, capsys, content, words
+):
     path = tmp_path / "model.ckpt"
-    torch.save({"weights": Intruder()}, path)
-    with pytest.raises(LRMError, match="never run"):
-        load(CONFIGS["triposr"], path)
-    path.write_bytes(pickle.dumps(Intruder(), protocol=2))
-    with pytest.raises(LRMError, match="never run"):
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        torch.save(content, path)
+    with pytest.raises(LRMError, match=words):
         load(CONFIGS["triposr"], path)
     assert capsys.readouterr().out == ""
 
 
-def test_damaged_files_are_named(tmp_path):
+@pytest.mark.parametrize("file", ["model.safetensors", "model.ckpt"])
+def test_damaged_files_are_named(tmp_path, file):
     settings, state = reduced("triposr")
-    for file in ("model.safetensors", "model.ckpt"):
-        path = save(tmp_path / file, state)
-        whole = path.read_bytes()
-        for content in (whole[: len(whole) // 2], whole[:10], b"", b"<html>not found</html>"):
-            path.write_bytes(content)
-            with pytest.raises(LRMError, match=file):
-                load(settings, path)
-        for content in (b"error", b"\x80\x02" + bytes(range(256)), bytes(64)):
-            path.write_bytes(content)
-            with pytest.raises(LRMError, match=file):
-                load(settings, path)
-        path.unlink()
-        with pytest.raises(LRMError, match="is not a file"):
+    path = save(tmp_path / file, state)
+    whole = path.read_bytes()
+    for content in (whole[: len(whole) // 2], whole[:10], b"", b"<html>not found", bytes(64)):
+        path.write_bytes(content)
+        with pytest.raises(LRMError, match=file):
             load(settings, path)
-
-
-def test_files_without_weights_are_refused(tmp_path):
-    for content in ({"step": 3}, [1, 2], {}, {"weights": {"a": 1}}):
-        path = tmp_path / "model.ckpt"
-        torch.save(content, path)
-        with pytest.raises(LRMError, match="no named weights"):
-            load(CONFIGS["triposr"], path)
+    path.unlink()
+    with pytest.raises(LRMError, match="is not a file"):
+        load(settings, path)
 
 
 def test_a_model_that_fits_nothing_published_says_so(tmp_path):
@@ -258,9 +253,8 @@ def test_weights_that_are_not_finite_are_named(tmp_path, value):
 
 def test_sizes_that_make_no_model_are_refused(tmp_path):
     settings, state = reduced("triposr")
-    width = {"tokenizer": settings["tokenizer"] | {"num_channels": 33}}
-    inner = {"backbone": settings["backbone"] | {"in_channels": 33}}
-    last = {"post_processor": settings["post_processor"] | {"in_channels": 33}}
+    odd = {"tokenizer": "num_channels", "backbone": "in_channels", "post_processor": "in_channels"}
+    settings = settings | {part: settings[part] | {key: 33} for part, key in odd.items()}
     path = save(tmp_path / "model.safetensors", state)
     with pytest.raises(LRMError, match="configuration cannot be used"):
-        load(settings | width | inner | last, path)
+        load(settings, path)

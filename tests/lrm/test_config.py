@@ -44,14 +44,8 @@ def test_references_are_followed():
 
 
 def test_what_the_file_does_not_say_can_be_given():
-    config = parse_config(
-        {
-            **CONFIGS["openlrm-1.0"],
-            "image_size": 96,
-            "image_mean": [0.5] * 3,
-            "image_std": [0.5] * 3,
-        }
-    )
+    more = {"image_size": 96, "image_mean": [0.5] * 3, "image_std": [0.5] * 3}
+    config = parse_config({**CONFIGS["openlrm-1.0"], **more})
     assert config.image_size == 96
     assert config.encoder.mean == config.encoder.std == (0.5, 0.5, 0.5)
 

@@ -96,19 +96,3 @@ def test_triposr_renderer():
         rays = origins.view(-1, 3), directions.view(-1, 3)
         found = triposr_oracle.render(query, *rays, samples=24)
         compare(found.view(truth["images"].shape), truth["images"], case=file)
-
-
-def test_triposr_camera_circle():
-    truth = arrays("cameras/triposr.npz")
-    origins, directions = triposr_oracle.orbit_rays(4, 0.0, 1.9, 40.0, 8, 8)
-    compare(origins, truth["rays_o"])
-    compare(directions, truth["rays_d"])
-
-
-def test_openlrm_canonical_rays():
-    truth = arrays("cameras/openlrm.npz")
-    origins, directions = openlrm_oracle.window_rays(
-        truth["canonical25"], torch.zeros(1, 2), torch.tensor([8.0]), 8
-    )
-    compare(origins.view(8, 8, 3), truth["canonical_rays_o_8x8"])
-    compare(directions.view(8, 8, 3), truth["canonical_rays_d_8x8"])

@@ -43,9 +43,8 @@ class Hub(http.server.BaseHTTPRequestHandler):
 
     def _answer(self, *, body):
         type(self).requests.append((self.command, self.path))
-        if self.path != f"/{SOURCE.repository}/resolve/{SOURCE.revision}/{SOURCE.file}" and (
-            self.path != f"/{SOURCE.repository}/resolve/{COMMIT}/{SOURCE.file}"
-        ):
+        places = (f"resolve/{revision}/{SOURCE.file}" for revision in (SOURCE.revision, COMMIT))
+        if self.path not in [f"/{SOURCE.repository}/{place}" for place in places]:
             self.send_response(404)
             self.send_header("X-Error-Code", "RepoNotFound")
             self.send_header("Content-Length", "0")

@@ -30,9 +30,9 @@ def frames_of(count, size=20, seed=0):
     return (whole * 255).to(torch.uint8)
 
 
-def run(model, frames, cache, batch=2, key="weights"):
+def run(model, frames, cache, batch=2, key="weights", **options):
     crop = square_crop(*frames.shape[1:3])
-    return encode(model, key, frames, crop, cache, CPU, batch=batch)
+    return encode(model, key, frames, crop, cache, CPU, batch=batch, **options)
 
 
 def test_every_frame_gets_the_triplane_of_its_own_image(tmp_path):
@@ -102,9 +102,7 @@ def test_alpha_is_taken_out_of_colours():
 
 def test_bfloat16_is_kept_apart_and_close(tmp_path):
     model, frames, cache = model_of(), frames_of(3), StageCache(tmp_path)
-    crop = square_crop(*frames.shape[1:3])
-    exact = encode(model, "weights", frames, crop, cache, CPU, batch=2)
-    rough = encode(model, "weights", frames, crop, cache, CPU, batch=2, bf16=True)
+    exact, rough = (run(model, frames, cache, bf16=bf16) for bf16 in (False, True))
     assert rough.cached == 0
     assert rough.triplanes.dtype == torch.float32
     gap = (rough.triplanes - exact.triplanes).norm() / exact.triplanes.norm()

@@ -11,7 +11,7 @@ import torch
 from tests.balls import ball_scene
 from tests.preparation.sequences import OPTIONS, blob, moving_sequence, static_features
 from tests.refusals import assert_refused
-from tests.training.runs import small_config
+from tests.training.runs import same_state, small_config
 from xplanes import run
 from xplanes.decomposition import unexplained_energy
 from xplanes.errors import ConfigError
@@ -78,13 +78,8 @@ def test_a_rank_one_initialisation_explains_what_moves(finished):
         ("six_planes", "nine_planes"), ((16, 8), (24, 8), (9, 5))
     ):
         case = f"{model} of {resolution} texels, {rows} rows"
-        found, module = initialised(
-            folder,
-            SEQUENCE,
-            f"model={model}",
-            f"model.resolution={resolution}",
-            f"model.time_resolution={rows}",
-        )
+        sizes = (f"model.resolution={resolution}", f"model.time_resolution={rows}")
+        found, module = initialised(folder, SEQUENCE, f"model={model}", *sizes)
         field = module.field
         count = len(PLANE_SETS[field.plane_set][-1]) * 3 if model == "nine_planes" else 3
         assert field.space.shape == (3, resolution, resolution, 8), case
@@ -123,9 +118,9 @@ def test_reports_and_seconds_are_whole(finished):
     assert set(found.seconds) == set(STAGES)
     assert found.seconds["fixed_view"] == 0
     assert all(found.seconds[name] > 0 for name in STAGES[1:])
-    assert found.pictures["decomposition"].shape == (3 * 132, 8 * 132, 3)
-    assert found.pictures["decomposition"].min() >= 0
-    assert found.pictures["decomposition"].max() <= 1
+    picture = found.pictures["decomposition"]
+    assert picture.shape == (3 * 132, 8 * 132, 3)
+    assert 0 <= picture.min() < picture.max() <= 1
 
 
 def test_a_second_initialisation_comes_from_the_cache(finished, monkeypatch):
@@ -141,9 +136,7 @@ def test_a_second_initialisation_comes_from_the_cache(finished, monkeypatch):
     for stage in ("decomposition", "convert"):
         assert again.seconds[stage] == first.seconds[stage]
     assert torch.equal(other.model.sparse, module.model.sparse)
-    assert all(
-        torch.equal(again.values.planes[name], plane) for name, plane in first.values.planes.items()
-    )
+    same_state(again.values.planes, first.values.planes)
     assert "cached" in again.description
     with pytest.raises(AssertionError, match="computed again"):
         initialised(folder, SEQUENCE, "decomposition.tolerance=0.001")
@@ -254,15 +247,8 @@ def test_the_video_of_a_run_shows_the_field_in_its_own_frame(scenes, tmp_path, m
 
     monkeypatch.setattr(render, "render_path", note)
     monkeypatch.setattr(render, "FRAMES", 2)
-    plain = small_config(
-        scenes,
-        "lrm=file",
-        f"lrm.triplanes={tmp_path}/a.pt",
-        "preparation.cache=null",
-        "trainer.max_steps=1",
-        "media=true",
-        "logger=none",
-    )
+    source = ("lrm=file", f"lrm.triplanes={tmp_path}/a.pt", "preparation.cache=null")
+    plain = small_config(scenes, *source, "trainer.max_steps=1", "media=true", "logger=none")
     run.run(plain, tmp_path / "run", [], resume=False)
     (found,) = shown
     assert found.scale == frame.scale

@@ -47,15 +47,8 @@ def publish(folder: Path, name: str) -> Path:
 
 
 def plain_settings(folder: Path, name: str, *overrides: str) -> dict:
-    path = publish(folder / name, name)
-    return small_config(
-        folder,
-        *CHOICES[name],
-        f"lrm.weights={path}",
-        "preparation.frames=3",
-        "lrm.precision=32",
-        *overrides,
-    )
+    given = (f"lrm.weights={publish(folder / name, name)}", "lrm.precision=32")
+    return small_config(folder, *CHOICES[name], *given, "preparation.frames=3", *overrides)
 
 
 def settings(folder: Path, name: str, *overrides: str) -> Method:
@@ -122,13 +115,8 @@ def check_field_of_model(folder: Path, name: str, matching: str) -> None:
     expected_colour, expected = ask(own, model.decoder, in_model / model.half_side)
     compare(colour[kept], expected_colour[kept], atol=2e-4, rtol=0, case=case)
     # Both as density per unit of the world.
-    compare(
-        (density * sequence.frame.scale)[kept],
-        (expected * alignment.frame.scale)[kept],
-        rtol=2e-3,
-        atol=1e-5,
-        case=case,
-    )
+    density, expected = density * sequence.frame.scale, expected * alignment.frame.scale
+    compare(density[kept], expected[kept], rtol=2e-3, atol=1e-5, case=case)
     assert density[kept].max() > 1e-4, case
     if name == "triposr":
         assert model.decoder.density_scale == pytest.approx(1 / CHORD)

@@ -1,7 +1,6 @@
 """Compositing: values and gradients against Beer and Lambert, at every density."""
 
 import functools
-import itertools
 import math
 
 import numpy as np
@@ -33,7 +32,7 @@ def kernels(depth, colour, distances, ray, starts, number=None):
 
 
 PLAIN = (composite, composite_reference)
-ALL = (*PLAIN, *([kernels] if triton else []))
+of_each = pytest.mark.parametrize("merge", [*PLAIN, *([kernels] if triton else [])])
 FLOATS = (torch.float32, torch.float64)
 COUNTS = (0, 3, 1, 0, 0, 7, 12, 0)
 """Samples of each ray: none at the ends and in the middle."""
@@ -88,58 +87,56 @@ def test_rays_that_end_at_one_surface_or_at_none_have_no_distortion():
     assert spread(nothing, torch.empty(0, 3), nothing, none, none, 4.0, 0.1) == 0
 
 
-@pytest.mark.parametrize("merge", ALL)
-def test_values_equal_the_loops_of_the_oracle(merge):
-    for dtype, scale in itertools.product(FLOATS, (0.0, 1e-8, 1e-3, 1.0, 30.0)):
-        case = f"{dtype}, depths up to {scale}"
-        inputs = rays_of(dtype=dtype, scale=scale)
-        total, weights = merge(*inputs)
-        expected, expected_weights = expected_of(*inputs)
-        tolerance = {"atol": 1e-30, "rtol": 1e-6 if dtype == torch.float32 else 1e-7}
-        np.testing.assert_allclose(total, expected, **tolerance, err_msg=case)
-        if scale != 1e-8:  # 1 - exp(-x) loses digits in the oracle, not in the code
-            tolerance["atol"] = 1e-7
-            np.testing.assert_allclose(weights, expected_weights, **tolerance, err_msg=case)
-        assert total.dtype == weights.dtype == dtype, case
+@of_each
+@pytest.mark.parametrize("scale", [0.0, 1e-8, 1e-3, 1.0, 30.0])
+@pytest.mark.parametrize("dtype", FLOATS)
+def test_values_equal_the_loops_of_the_oracle(merge, dtype, scale):
+    inputs = rays_of(dtype=dtype, scale=scale)
+    total, weights = merge(*inputs)
+    expected, expected_weights = expected_of(*inputs)
+    rounding = 1e-6 if dtype == torch.float32 else 1e-7
+    np.testing.assert_allclose(total, expected, atol=1e-30, rtol=rounding)
+    if scale != 1e-8:  # 1 - exp(-x) loses digits in the oracle, not in the code
+        np.testing.assert_allclose(weights, expected_weights, atol=1e-7, rtol=rounding)
+    assert total.dtype == weights.dtype == dtype
 
 
-def test_gradients_follow_the_product_rule():
-    for merge, scale in itertools.product(ALL, (1e-3, 1.0, 20.0)):
-        depth, colour, *rest = rays_of(scale=scale)
-        depth.requires_grad_()
-        colour.requires_grad_()
-        total, _ = merge(depth, colour, *rest)
-        upstream = torch.randn(total.shape, generator=torch.Generator().manual_seed(2)).double()
-        ours = torch.autograd.grad((total * upstream).sum(), (depth, colour))
-        arrays = (t.detach().numpy() for t in (depth, colour, rest[0]))
-        theirs = composite_gradient(*arrays, rest[1].tolist(), len(rest[2]), upstream.numpy())
-        for a, b in zip(ours, theirs, strict=True):
-            np.testing.assert_allclose(a, b, atol=1e-10, err_msg=f"{merge.__name__}, {scale}")
+@of_each
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 20.0])
+def test_gradients_follow_the_product_rule(merge, scale):
+    inputs = rays_of(scale=scale)
+    ours = values_and_gradients(merge, *inputs)[2:]
+    arrays = (tensor.numpy() for tensor in inputs[:3])
+    ray, starts = inputs[3:]
+    theirs = composite_gradient(
+        *arrays, ray.tolist(), len(starts), upstream_of(len(starts)).numpy()
+    )
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-10)
 
 
-def test_thick_media_keep_their_digits_in_the_gradient():
-    for merge in ALL:
-        depth = torch.tensor([20.0], requires_grad=True)
-        nothing = torch.zeros(1, dtype=torch.long)
-        total, _ = merge(depth, torch.ones(1, 3), torch.ones(1), nothing, nothing)
-        total[0, 3].backward()
-        assert float(depth.grad) == pytest.approx(math.exp(-20), rel=1e-5), merge.__name__
+@of_each
+def test_thick_media_keep_their_digits_in_the_gradient(merge):
+    depth = torch.tensor([20.0], requires_grad=True)
+    nothing = torch.zeros(1, dtype=torch.long)
+    total, _ = merge(depth, torch.ones(1, 3), torch.ones(1), nothing, nothing)
+    total[0, 3].backward()
+    assert float(depth.grad) == pytest.approx(math.exp(-20), rel=1e-5)
+
+
+def upstream_of(rays, dtype=torch.float64):
+    return torch.linspace(-1, 1.3, 5 * rays, dtype=dtype).view(rays, 5)
 
 
 def values_and_gradients(merge, depth, colour, *rest):
     """Sums, weights, and gradients of depths and colours."""
     leaves = [tensor.clone().requires_grad_() for tensor in (depth, colour)]
     total, weights = merge(*leaves, *rest)
-    upstream = torch.linspace(-1, 1.3, total.numel(), dtype=total.dtype).view_as(total)
-    gradients = torch.autograd.grad((total * upstream).sum(), leaves)
+    gradients = torch.autograd.grad((total * upstream_of(len(total), total.dtype)).sum(), leaves)
     return [found.detach() for found in (total, weights, *gradients)]
 
 
-def agree(ours, theirs, *, case, **tolerance):
-    for a, b in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(
-            a, b, check_dtype=False, equal_nan=True, msg=lambda m: f"{case}: {m}", **tolerance
-        )
+agree = functools.partial(torch.testing.assert_close, check_dtype=False, equal_nan=True)
 
 
 def doubled(inputs):
@@ -147,52 +144,49 @@ def doubled(inputs):
 
 
 DENSITIES = [0.0, 1e-30, 1e-8, 1e-3, 1.0, 30.0, 79.9, 80.1, 1e3, 1e8, 3e38, math.inf]
+DENSITIES += [-1e-9, -1.0, -math.inf]
 
 
+@pytest.mark.parametrize("density", DENSITIES)
 @pytest.mark.parametrize("dtype", FLOATS)
-def test_loops_and_twin_agree_at_every_density(dtype):
-    for value in (*DENSITIES, -1e-9, -1.0, -math.inf):
-        depth, colour, *rest = rays_of(dtype=dtype)
-        depth[::3] = value
-        found = [values_and_gradients(merge, depth, colour, *rest) for merge in PLAIN]
-        agree(*found, atol=2e-5, rtol=1e-5, case=f"density {value}")
+def test_loops_and_twin_agree_at_every_density(dtype, density):
+    depth, colour, *rest = rays_of(dtype=dtype)
+    depth[::3] = density
+    found = [values_and_gradients(merge, depth, colour, *rest) for merge in PLAIN]
+    agree(*found, atol=2e-5, rtol=1e-5)
 
 
-def test_a_nan_stays_on_its_ray():
-    for merge in ALL:
-        depth, colour, distances, ray, starts = rays_of()
-        clean, _ = merge(depth, colour, distances, ray, starts)
-        depth = depth.clone()
-        depth[5] = math.nan
-        total, _ = merge(depth, colour, distances, ray, starts)
-        broken = int(ray[5])
-        assert total[broken].isnan().all(), merge.__name__
-        others = torch.arange(len(starts)) != broken
-        torch.testing.assert_close(total[others], clean[others], atol=1e-14, rtol=0)
+@of_each
+def test_a_nan_stays_on_its_ray(merge):
+    depth, *rest = rays_of()
+    ray, starts = rest[2:]
+    clean, _ = merge(depth, *rest)
+    broken = int(ray[5])
+    total, _ = merge(depth.index_fill(0, torch.tensor(5), math.nan), *rest)
+    assert total[broken].isnan().all()
+    others = torch.arange(len(starts)) != broken
+    agree(total[others], clean[others], atol=1e-14, rtol=0)
 
 
-def test_no_rays_and_rays_without_samples_see_nothing():
-    for merge in ALL:
-        depth, colour, *rest = rays_of((0, 0, 0))
-        depth.requires_grad_()
-        total, weights = merge(depth, colour, *rest)
-        assert torch.equal(total.detach(), torch.zeros(3, 5).double()), merge.__name__
-        assert weights.shape == (0,), merge.__name__
-        total.sum().backward()
-        assert depth.grad.shape == (0,), merge.__name__
-        total, weights = merge(*rays_of(()))
-        assert total.shape == (0, 5), merge.__name__
-        assert weights.shape == (0,), merge.__name__
+@of_each
+def test_no_rays_and_rays_without_samples_see_nothing(merge):
+    total, weights, gradient, _ = values_and_gradients(merge, *rays_of((0, 0, 0)))
+    assert torch.equal(total, torch.zeros(3, 5).double())
+    assert weights.shape == gradient.shape == (0,)
+    total, weights = merge(*rays_of(()))
+    assert (total.shape, weights.shape) == ((0, 5), (0,))
 
 
-def test_weights_carry_no_gradient_and_only_what_asks_gets_one():
-    for merge in ALL:
-        depth, colour, *rest = rays_of()
-        _, weights = merge(depth.requires_grad_(), colour, *rest)
-        assert not weights.requires_grad, merge.__name__
+@of_each
+def test_weights_carry_no_gradient(merge):
+    depth, *rest = rays_of()
+    _, weights = merge(depth.requires_grad_(), *rest)
+    assert not weights.requires_grad
+
+
+def test_only_what_asks_gets_a_gradient():
     depth, colour, *rest = rays_of()
-    colour.requires_grad_()
-    composite(depth, colour, *rest)[0].sum().backward()
+    composite(depth, colour.requires_grad_(), *rest)[0].sum().backward()
     assert colour.grad.abs().max() > 0
     assert depth.grad is None
 
@@ -216,58 +210,56 @@ LENGTHS = (1000, 0, 1, 31, 32, 33, 64, 65, 0)
 
 
 @needs_triton
-def test_sums_in_float32_keep_their_digits_on_long_rays():
-    for scale in (0.01, 0.3, 20.0):
-        inputs = rays_of(LENGTHS, torch.float32, scale=scale)
-        exact = values_and_gradients(composite_reference, *doubled(inputs))
-        ours, twins = (values_and_gradients(f, *inputs) for f in (kernels, composite_reference))
-        for found, twin, truth in zip(ours, twins, exact, strict=True):
-            errors = [float((t - truth).abs().max() / truth.abs().max()) for t in (found, twin)]
-            assert errors[0] < max(1e-6, 2 * errors[1]), (scale, errors)
+@pytest.mark.parametrize("scale", [0.01, 0.3, 20.0])
+def test_sums_in_float32_keep_their_digits_on_long_rays(scale):
+    inputs = rays_of(LENGTHS, torch.float32, scale=scale)
+    exact = values_and_gradients(composite_reference, *doubled(inputs))
+    ours, twins = (values_and_gradients(f, *inputs) for f in (kernels, composite_reference))
+    for found, twin, truth in zip(ours, twins, exact, strict=True):
+        errors = [float((t - truth).abs().max() / truth.abs().max()) for t in (found, twin)]
+        assert errors[0] < max(1e-6, 2 * errors[1])
 
 
 @needs_triton
 def test_faint_gradients_keep_their_digits_too():
     """An optimiser scales them up: what is left of much light less much light would be noise."""
-    depth, colour, distances, ray, starts = rays_of((70,), torch.float32)
+    depth, *rest = rays_of((70,), torch.float32)
     depth[::10] = 7.0
-    found = values_and_gradients(kernels, depth, colour, distances, ray, starts)
-    inputs = doubled((depth, colour, distances, ray, starts))
-    exact = values_and_gradients(composite_reference, *inputs)
-    assert exact[2].abs().min() < 1e-15
-    torch.testing.assert_close(found[2].double(), exact[2], atol=1e-28, rtol=1e-3)
+    found = values_and_gradients(kernels, depth, *rest)[2]
+    exact = values_and_gradients(composite_reference, *doubled((depth, *rest)))[2]
+    assert exact.abs().min() < 1e-15
+    agree(found, exact, atol=1e-28, rtol=1e-3)
 
 
 @needs_triton
-def test_places_without_a_sample_change_nothing_and_get_nothing():
-    room = 50
-    for counts in (COUNTS, (*COUNTS[:-1], 2)):
-        depth, colour, distances, ray, starts = filled = rays_of(counts)
-        given = len(ray)
-        more = room - given
-        padded = (
-            torch.cat([depth, torch.zeros(more)]),
-            torch.cat([colour, torch.rand(more, 3)]),
-            torch.cat([distances, torch.zeros(more)]),
-            torch.cat([ray, torch.full((more,), len(starts) - 1)]),
-            starts,
-        )
-        expected = values_and_gradients(composite_reference, *filled)
-        some = functools.partial(kernels, number=torch.tensor(given))
-        for merge in (some, composite_reference):
-            found = values_and_gradients(merge, *padded)
-            kept = [found[0], *(part[:given] for part in found[1:])]
-            agree(kept, expected, atol=1e-12, rtol=0, case=counts)
-            assert not any(part[given:].any() for part in (found[1], found[3]))
-        assert not values_and_gradients(some, *padded)[2][given:].any()
+@pytest.mark.parametrize("last", [0, 2])
+def test_places_without_a_sample_change_nothing_and_get_nothing(last):
+    depth, colour, distances, ray, starts = filled = rays_of((*COUNTS[:-1], last))
+    given = len(ray)
+    more = 50 - given
+    padded = (
+        torch.cat([depth, torch.zeros(more)]),
+        torch.cat([colour, torch.rand(more, 3)]),
+        torch.cat([distances, torch.zeros(more)]),
+        torch.cat([ray, torch.full((more,), len(starts) - 1)]),
+        starts,
+    )
+    expected = values_and_gradients(composite_reference, *filled)
+    some = functools.partial(kernels, number=torch.tensor(given))
+    for merge in (some, composite_reference):
+        found = values_and_gradients(merge, *padded)
+        kept = [found[0], *(part[:given] for part in found[1:])]
+        agree(kept, expected, atol=1e-12, rtol=0)
+        assert not any(part[given:].any() for part in (found[1], found[3]))
+    assert not values_and_gradients(some, *padded)[2][given:].any()
 
 
 @needs_triton
 def test_kernels_agree_with_the_twin_at_every_density():
-    depth, colour, *rest = rays_of((15, 1, 15), torch.float32)
-    values = torch.tensor((*DENSITIES, -1e-9, -1.0, -math.inf))
-    depth[:15], depth[16:] = values, values.flip(0)
-    found = values_and_gradients(kernels, depth, colour, *rest)
-    expected = values_and_gradients(composite_reference, *doubled((depth, colour, *rest)))
+    depth, *rest = rays_of((15, 1, 15), torch.float32)
+    depth[:15] = torch.tensor(DENSITIES)
+    depth[16:] = depth[:15].flip(0)
+    found = values_and_gradients(kernels, depth, *rest)
+    expected = values_and_gradients(composite_reference, *doubled((depth, *rest)))
     assert all(part.isfinite().all() for part in found)
-    agree(found, expected, atol=1e-6, rtol=1e-6, case="all densities")
+    agree(found, expected, atol=1e-6, rtol=1e-6)

@@ -1,5 +1,6 @@
 """The occupancy grid: updates, decay, sweeps and pruned cells."""
 
+import itertools
 import math
 
 import pytest
@@ -18,15 +19,31 @@ def grid_of(resolution=4, bins=2, **options):
     )
 
 
-def constant(density):
-    def field(points, times):
-        return torch.zeros(len(points), 3), torch.full((len(points),), float(density))
+class Even:
+    """A field of one density, which keeps the places and times that it is asked for."""
 
-    return field
+    def __init__(self, density):
+        self.density, self.asked = density, []
+
+    def __call__(self, points, times):
+        self.asked.append((points, times))
+        return torch.zeros(len(points), 3), torch.full((len(points),), float(self.density))
+
+    def cells(self, grid):
+        """The cell of each look."""
+        return torch.cat([cells_of(grid, *places) for places in self.asked])
 
 
 def generator(seed=0):
     return torch.Generator().manual_seed(seed)
+
+
+def update(grid, field, step, by_numbers):
+    """64 looks, drawn by a generator or by numbers that are given."""
+    if by_numbers:
+        grid.update_by(field, counted_uniform(0, step, 1, (64, 8), torch.device("cpu")))
+    else:
+        grid.update(field, 64, generator(step))
 
 
 def cells_of(grid, points, times):
@@ -55,18 +72,12 @@ def test_presumed_cells_are_empty_until_something_shows():
 def test_presumed_cells_fill_from_their_occupied_neighbours_on():
     # The corner (3, 0, 0) of the first time bin: its neighbours are 2, 7 and 19. The next cell in
     # memory, 4, lies across the grid, and 64 + 3 in the other bin.
-    grid = presumed(3)
-    looked = []
-
-    def field(points, times):
-        looked.append(cells_of(grid, points, times))
-        return constant(100.0)(points, times)
-
+    grid, field = presumed(3), Even(100.0)
     grid.update(field, 3000, generator())
-    assert set(torch.cat(looked).tolist()) == {2, 3, 7, 19}
+    assert set(field.cells(grid).tolist()) == {2, 3, 7, 19}
     assert grid.occupied.nonzero()[:, 0].tolist() == [2, 3, 7, 19]
     for _ in range(8):
-        grid.update(constant(100.0), 3000, generator())
+        grid.update(field, 3000, generator())
     assert grid.occupied[:64].all()
     assert not grid.occupied[64:].any()
 
@@ -110,7 +121,7 @@ def test_likely_cells_fill_wherever_they_are():
     grid = presumed(3, 60)
     grid.density.zero_()
     grid.occupied.zero_()
-    grid.update(constant(100.0), 3000, generator())
+    grid.update(Even(100.0), 3000, generator())
     assert grid.occupied.nonzero()[:, 0].tolist() == [3, 60]
 
 
@@ -170,11 +181,11 @@ def test_what_is_there_only_at_times_hides_nothing():
 
 
 def test_a_sweep_sees_that_a_cell_lets_light_through():
-    grid, generator = grid_of(), torch.Generator().manual_seed(0)
+    grid = grid_of()
     cells = torch.arange(len(grid.density))
     for _ in range(60):
         grid.observe(cells, torch.full((len(cells),), 50.0))
-    grid.sweep(lambda points, times: (points, torch.full_like(times, 3.0)), generator)
+    grid.sweep(Even(3.0), generator())
     assert (grid.least == 3).all()
 
 
@@ -184,31 +195,30 @@ def test_the_threshold_is_opacity_over_one_step():
     assert grid.occupied[:3].tolist() == [False, False, True]
 
 
-def test_of_many_looks_at_one_cell_the_largest_counts():
-    for order in ([0.5, 7.0, 1.0], [7.0, 0.5, 1.0], [1.0, 0.5, 7.0]):
-        grid = grid_of()
-        grid.observe(torch.tensor([5, 5, 5]), torch.tensor(order))
-        assert grid.density[5] == 7
-
-
-def test_many_looks_at_once_decay_once():
+@pytest.mark.parametrize(
+    ("looks", "found"),
+    [
+        ([0.0, 0.0, 0.0], 0.5 * 4 * 0.01 / STEP),  # Half of the initial density.
+        *((looks, 7.0) for looks in itertools.permutations([0.5, 7.0, 1.0])),
+    ],
+)
+def test_many_looks_at_once_decay_a_cell_once_and_the_largest_counts(looks, found):
     grid = grid_of()
-    start = float(grid.density[5])
-    grid.observe(torch.tensor([5, 5, 5, 5]), torch.zeros(4))
-    assert grid.density[5] == pytest.approx(0.5 * start)
+    grid.observe(torch.tensor([5, 5, 5]), torch.tensor(looks))
+    assert grid.density[5] == pytest.approx(found)
 
 
-def test_a_cell_recovers_from_an_impossible_density():
-    for bad in [math.nan, math.inf, -math.inf, 3e38]:
-        grid, cell = grid_of(), torch.tensor([2])
-        grid.observe(cell, torch.tensor([bad]))
-        assert grid.density.isfinite().all(), bad
-        assert grid.least.isfinite().all(), bad
-        for _ in range(60):
-            grid.observe(cell, torch.zeros(1))
-        assert not grid.occupied[2], bad
-        grid.observe(cell, torch.tensor([4.0]))
-        assert grid.occupied[2], bad
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 3e38])
+def test_a_cell_recovers_from_an_impossible_density(bad):
+    grid, cell = grid_of(), torch.tensor([2])
+    grid.observe(cell, torch.tensor([bad]))
+    assert grid.density.isfinite().all()
+    assert grid.least.isfinite().all()
+    for _ in range(60):
+        grid.observe(cell, torch.zeros(1))
+    assert not grid.occupied[2]
+    grid.observe(cell, torch.tensor([4.0]))
+    assert grid.occupied[2]
 
 
 def test_time_bins_share_out_zero_to_one():
@@ -228,28 +238,20 @@ def test_drawn_points_lie_in_their_cells():
 
 
 def test_update_looks_at_random_allowed_cells_in_all_bins():
-    grid = grid_of(4, 2)
+    grid, field = grid_of(4, 2), Even(0.0)
     allowed = torch.rand(2, 4, 4, 4, generator=generator(3)) < 0.5
     grid.allow(allowed)
-    seen = []
-
-    def field(points, times):
-        seen.append(cells_of(grid, points, times))
-        return constant(0.0)(points, times)
-
     grid.update(field, 2000, generator())
-    looked = torch.zeros(128, dtype=torch.bool)
-    looked[seen[0]] = True
-    assert torch.equal(looked, allowed.flatten())
+    assert torch.equal(field.cells(grid).unique(), allowed.flatten().nonzero()[:, 0])
 
 
 def test_update_empties_an_empty_grid_and_finds_what_appears():
     grid, draw = grid_of(), generator()
     for _ in range(20):
-        grid.update(constant(0.0), 500, draw)
+        grid.update(Even(0.0), 500, draw)
     assert grid.occupied_fraction == 0
     for _ in range(5):
-        grid.update(constant(3.0), 500, draw)
+        grid.update(Even(3.0), 500, draw)
     assert grid.occupied_fraction == 1
 
 
@@ -262,8 +264,8 @@ def test_cells_that_are_ruled_out_never_fill():
     assert torch.equal(grid.occupied, ~out)
     for seed in range(3):
         grid.observe(everywhere, torch.full((len(everywhere),), 1e6))
-        grid.update(constant(1e6), 300, generator(seed))
-        grid.sweep(constant(1e6), generator(seed))
+        grid.update(Even(1e6), 300, generator(seed))
+        grid.sweep(Even(1e6), generator(seed))
         assert not grid.occupied[out].any()
         assert (grid.density[out] == 0).all()
         assert grid.occupied[~out].all()
@@ -307,16 +309,10 @@ def test_swept_cells_without_content_of_their_own_have_one_more_look():
 
 
 def test_a_sweep_does_not_bring_empty_cells_back_and_asks_only_the_occupied():
-    grid = grid_of(8, 1, decay=0.0)
+    grid, field = grid_of(8, 1, decay=0.0), Even(9.0)
     grid.observe(torch.arange(256), torch.zeros(256))
-    asked = []
-
-    def field(points, times):
-        asked.append(len(points))
-        return constant(9.0)(points, times)
-
     grid.sweep(field, generator(), chunk=100)
-    assert asked == [100, 100, 56]
+    assert [len(points) for points, _ in field.asked] == [100, 100, 56]
     assert not grid.occupied[:256].any()
     assert grid.occupied[256:].all()
 
@@ -349,24 +345,15 @@ def test_looks_by_given_numbers_reach_the_same_cells():
         corner = torch.zeros(1, 6, 6, 6, dtype=torch.bool)
         corner[0, :3, :3, :3] = True
         grid.presume(corner)
-        ruled_out = torch.ones(1, 6, 6, 6, dtype=torch.bool)
-        ruled_out[0, 0] = False
-        grid.allow(ruled_out)
-        seen = torch.zeros(216)
-
-        def field(points, times, grid=grid, seen=seen):
-            seen += cells_of(grid, points, times).bincount(minlength=216)
-            return constant(0.0)(points, times)
-
-        before = grid.occupied.clone()
+        allowed = torch.ones(1, 6, 6, 6, dtype=torch.bool)
+        allowed[0, 0] = False
+        grid.allow(allowed)
+        before, field = grid.occupied.clone(), Even(0.0)
         for step in range(200):
             grid.density.copy_(before * 10.0)
             grid.occupied.copy_(before)
-            if by_numbers:
-                grid.update_by(field, counted_uniform(0, step, 1, (64, 8), torch.device("cpu")))
-            else:
-                grid.update(field, 64, generator(step))
-        reached.append(seen)
+            update(grid, field, step, by_numbers)
+        reached.append(field.cells(grid).bincount(minlength=216))
     plain, counted = reached
     # The twin leaves out cells that must stay empty before it asks the field, the other after.
     asked = plain > 0
@@ -385,11 +372,7 @@ def test_looks_never_fill_cells_that_must_stay_empty(by_numbers):
     near[:2, :2, :2] = near[2, :2, :2] = near[:2, 2, :2] = near[:2, :2, 2] = True
     for step in range(20):
         before = grid.density.clone(), grid.occupied.clone()
-        if by_numbers:
-            uniform = counted_uniform(0, step, 1, (64, 8), torch.device("cpu"))
-            grid.update_by(constant(100.0), uniform)
-        else:
-            grid.update(constant(100.0), 64, generator(step))
+        update(grid, Even(100.0), step, by_numbers)
         assert not (grid.occupied.view(6, 6, 6) & ~near).any()
         grid.density.copy_(before[0])
         grid.occupied.copy_(before[1])

@@ -159,9 +159,8 @@ def test_corrections_are_the_same_on_a_gpu(fake_gpu):
         for step in range(4):
             drawn = batches_of(views).draw(step)
             rays = cameras.corrected_rays({name: value.to(device) for name, value in drawn.items()})
-            seen = (
-                part.to(device) for part in ball(rays["origins"].cpu(), rays["directions"].cpu())
-            )
+            shown = ball(rays["origins"].cpu(), rays["directions"].cpu())
+            seen = (part.to(device) for part in shown)
             cameras.observe(rays, Rendering(*seen, torch.empty(0), None))  # pyright: ignore
         cameras.solve()
         found.append(cameras.motion.cpu())
@@ -175,11 +174,10 @@ def test_what_the_field_can_undo_is_removed():
     own = torch.randn(6, 6, generator=generator, dtype=torch.float64)
     root = torch.randn(6, 6, 6, generator=generator, dtype=torch.float64)
     metric, known = root @ root.mT + torch.eye(6), torch.ones(6, dtype=torch.bool)
-    turn, shift = torch.tensor([0.1, -0.2, 0.3]).double(), torch.tensor([1.0, 2.0, -1.0]).double()
-    common = torch.cat(
-        [turn.expand(6, 3), torch.linalg.cross(turn.expand(6, 3), places) + shift + 0.4 * places],
-        dim=1,
-    )
+    turn = torch.tensor([0.1, -0.2, 0.3]).double().expand(6, 3)
+    shift = torch.tensor([1.0, 2.0, -1.0]).double()
+    moved = torch.linalg.cross(turn, places) + shift + 0.4 * places
+    common = torch.cat([turn, moved], dim=1)
     alone = without_common(places, own, metric, known)
     assert torch.allclose(without_common(places, own + common, metric, known), alone, atol=1e-9)
     # A camera without rays stays as it was.

@@ -629,7 +629,7 @@ WINGS = ("baselines", "synthetic", "tools")
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
 EDGES = {
-    "launch": {"config", "errors", "files", "hints", "process", "run", "sweeps"},
+    "launch": {"config", "errors", "experiment", "files", "hints", "process", "run", "sweeps"},
     "train": {"cli"},
 }
 """What the ends of the command line may import, which must be quick to start."""
@@ -763,12 +763,17 @@ QUICK = {
     "from xplanes.cli import build_parser, further_commands as more; "
     "print(build_parser(more()).format_help())": HEAVY,
     "from xplanes.cli import main; main(['inspect', 'nowhere'])": ("lightning", "xplanes.run"),
+    **{
+        f"from contextlib import suppress; from xplanes.launch import train\n"
+        f"with suppress(SystemExit): train({wrong})": ("lightning", "numba")
+        for wrong in (["data.resolution=abc"], ["data=dnerf", "data.scene=nowhere"])
+    },
 }
 """What must answer at once, and what it must not load."""
 
 
 def test_what_must_answer_at_once_loads_nothing_heavy(tmp_path):
-    codes = [f"{code}; print('heavy', {{*{no}}} & {{*sys.modules}})" for code, no in QUICK.items()]
+    codes = [f"{code}\nprint('heavy', {{*{no}}} & {{*sys.modules}})" for code, no in QUICK.items()]
     for (code, printed), told in zip(forked("", codes, tmp_path), QUICK, strict=True):
         assert code == 0, (told, printed)
         assert printed.endswith("heavy set()\n"), (told, printed)

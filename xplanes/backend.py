@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from xplanes.errors import DeviceError
+from xplanes.errors import ConfigError, DeviceError
 from xplanes.files import require_writable
 
 logger = logging.getLogger(__name__)
@@ -202,6 +202,23 @@ def _require_alive(device: torch.device, what: str, reason: str) -> None:
             f"{device}: the GPU stopped answering in a trial of the Triton kernels for {what} "
             f"({reason}). Start again with XPLANES_GPU_KERNELS=0, which disables them"
         ) from error
+
+
+def find_device(accelerator: str) -> torch.device:
+    """The device of ``trainer.accelerator``; auto: a CUDA GPU if there is one, else the CPU.
+
+    Raises:
+        ConfigError: If a GPU is requested but not found, or for another accelerator.
+    """
+    if accelerator not in ("auto", "cpu", "gpu", "cuda"):
+        raise ConfigError(f"accelerator={accelerator}: must be one of auto, cpu, gpu")
+    if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
+        raise ConfigError(
+            f"accelerator={accelerator}: no GPU found; set trainer.accelerator=cpu or auto"
+        )
+    if accelerator == "cpu" or not torch.cuda.is_available():
+        return torch.device("cpu")
+    return torch.device("cuda")
 
 
 def memory_left(device: torch.device) -> float:

@@ -1,20 +1,27 @@
-"""A whole run: its method, data, trainer, callbacks and logger, from a configuration."""
+"""A whole run: its method, data, trainer, callbacks and logger, from a configuration.
+
+Lightning, whose import takes longer than that of everything else, is imported only to build the
+Trainer: until then wrong settings of the method and the data are refused in half the time.
+"""
 
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-from lightning.pytorch.callbacks import Callback
-from lightning.pytorch.loggers import Logger, TensorBoardLogger
 
+from xplanes.backend import find_device
 from xplanes.components import build, class_of, plugins
 from xplanes.errors import ConfigError
 from xplanes.models.initialisation import Method
 from xplanes.scenes.source import SceneSettings
-from xplanes.training.fit import Trainer, find_device
+
+if TYPE_CHECKING:
+    from lightning.pytorch.loggers import Logger
+
+    from xplanes.training.fit import Trainer
 
 OWNERS = {
     "callbacks": "the group callbacks",
@@ -77,6 +84,15 @@ class Experiment:
         experiment.method.require_devices(experiment.devices)
         return experiment
 
+    def require_folder(self) -> None:
+        """Check that the folder of the scene exists, without reading it.
+
+        Raises:
+            SceneError: If it does not; the message says where to get the scene.
+        """
+        if self.data.files and not self.data.folder.exists():
+            self.data.load(("train",))
+
     @property
     def device(self) -> torch.device:
         """Device on which the field is trained.
@@ -95,12 +111,16 @@ class Experiment:
         devices = self.trainer.get("devices", 1)
         return devices if isinstance(devices, int) and devices > 0 else 1
 
-    def build_trainer(self, run: Path) -> Trainer:
+    def build_trainer(self, run: Path) -> "Trainer":
         """The Trainer, with callbacks and loggers, for a run directory.
 
         Raises:
             ConfigError: If one of them rejects its arguments.
         """
+        from lightning.pytorch.callbacks import Callback
+
+        from xplanes.training.fit import Trainer
+
         if self.devices > 1 and self.trainer.get("strategy", "auto") == "auto":
             raise ConfigError(
                 f"trainer.devices={self.devices} with trainer.strategy=auto: several devices need "
@@ -129,12 +149,14 @@ def _nodes(content: Any) -> dict[str, Mapping[str, Any]]:
     return {str(name): node for name, node in (content or {}).items() if node is not None}
 
 
-def _logger(name: str, node: Mapping[str, Any], run: Path) -> Logger:
+def _logger(name: str, node: Mapping[str, Any], run: Path) -> "Logger":
     """The logger of a node.
 
     TensorBoardLogger passes unknown arguments on to its writer, which rejects them only when the
     first curve is written. They are rejected here instead.
     """
+    from lightning.pytorch.loggers import Logger, TensorBoardLogger
+
     key = f"logger.{name}"
     cls = class_of(node.get("_target_"), Logger, f"{key}._target_")
     taken = inspect.signature(cls).parameters

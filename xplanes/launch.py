@@ -27,7 +27,7 @@ from xplanes.config import (
     unquoted,
     with_names,
 )
-from xplanes.errors import ConfigError
+from xplanes.errors import ConfigError, XPlanesError
 from xplanes.files import StorageError, read_json, require_writable
 from xplanes.hints import require_parsed, require_readable
 from xplanes.process import STARTED, train_command
@@ -92,8 +92,6 @@ class SettingsCheck(Callback):
     """
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        from xplanes.run import KNOWN_ERRORS, prepare
-
         if config.hydra.runtime.choices.get("sweep") and config.resume is None:
             task: Any = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
             given = shlex.join(text for text in task if key_and_value(text)[0] != "resume")
@@ -101,22 +99,32 @@ class SettingsCheck(Callback):
         names = [str(name) for name in config if name != "hydra"]
         HydraConfig.instance().set_config(config)  # As Hydra does for the job, for ${hydra:...}.
         try:
-            if (plain := _resolved(OmegaConf.masked_copy(config, names))) is not None:
-                # Fails here if a setting that names the run directory is missing.
-                _prepared[config.hydra.run.dir] = prepare(
-                    plain, Path(config.hydra.run.dir).absolute()
-                )
+            if (plain := _resolved(OmegaConf.masked_copy(config, names))) is None:
+                return
+            from xplanes.experiment import Experiment
+
+            experiment = Experiment.read(plain)
+            if config.resume is None:  # A resumed run may find its scene elsewhere.
+                experiment.require_folder()
+        except XPlanesError as error:
+            sys.exit(f"error: {error}")
+        # Imported now, because it takes long: wrong settings have been refused.
+        from xplanes.run import KNOWN_ERRORS, prepare
+
+        try:
+            # Fails here if a setting that names the run directory is missing.
+            folder = config.hydra.run.dir
+            _prepared[folder] = prepare(experiment, Path(folder).absolute())
         except KNOWN_ERRORS as error:
             sys.exit(f"error: {error}")
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        from xplanes.run import KNOWN_ERRORS
         from xplanes.sweeps import look_ahead
 
         try:
             if words := look_ahead(config):
                 print(words, flush=True)
-        except KNOWN_ERRORS as error:
+        except XPlanesError as error:
             sys.exit(f"error: {error}")
 
 

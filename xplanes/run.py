@@ -63,13 +63,12 @@ class Job:
     new: bool
 
 
-def prepare(config: dict[str, Any], folder: Path) -> Job:
-    """Parse the settings of a run and build its Trainer.
+def prepare(experiment: Experiment, folder: Path) -> Job:
+    """Build the Trainer of a run.
 
     Raises:
-        ConfigError: If settings are missing, out of range, or contradict one another.
+        ConfigError: If one of its arguments, callbacks or loggers is rejected.
     """
-    experiment = Experiment.read(config)
     return Job(experiment, experiment.build_trainer(folder), folder, not folder.exists())
 
 
@@ -105,7 +104,7 @@ def run(
         found = found_root(folder, root)
         job = job if found == root else None
         config = config | {"data": config["data"] | {"root": found}}
-    job = job or prepare(config, folder)
+    job = job or prepare(Experiment.read(config), folder)
     if int(os.environ.get("LOCAL_RANK", "0")):
         train(job, resume=resume)
         return float("nan")

@@ -93,9 +93,8 @@ def look_ahead(config: DictConfig) -> str:
     except HydraException:
         return ""
     runs = [run for job in found if (run := known[job]) is not None]
-    for data in {str(run.data): run.data for run in runs}.values():
-        if data.files and not data.folder.exists():
-            data.load(("train",))  # Its error says where to get the scene.
+    for run in {str(run.data): run for run in runs}.values():
+        run.require_folder()
     for lrm in {str(run.method.lrm): run.method.lrm for run in runs}.values():
         lrm.load()
     return _length(len(found), [run.trainer for run in runs])

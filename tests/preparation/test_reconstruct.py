@@ -14,6 +14,7 @@ from tests.lrm.reduced import SIDES, reduced
 from tests.lrm.reference import compare
 from tests.training.runs import small_config
 from xplanes.errors import ConfigError
+from xplanes.experiment import Experiment
 from xplanes.fields import Decoder, XPlanes
 from xplanes.lrm import LRMError
 from xplanes.lrm.triposr import CHORD
@@ -170,7 +171,7 @@ def test_weights_of_another_size_are_refused_before_any_scene_is_read(tmp_path):
     (tmp_path / "wrong" / "config.json").unlink()
     plain["lrm"]["weights"] = str(wrong)
     with pytest.raises(LRMError, match=r"does not fit openlrm-small-1\.1"):
-        train(prepare(plain, tmp_path / "run"), resume=False)
+        train(prepare(Experiment.read(plain), tmp_path / "run"), resume=False)
     assert not (tmp_path / "excavator_32px_s0").exists()
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 import torch.nn.functional as F
@@ -18,7 +18,9 @@ from xplanes.rendering.pictures import colour_map, to_bytes
 from xplanes.scenes.cameras import PosedCamera, orbit
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene, Views
-from xplanes.training.module import RadianceModule
+
+if TYPE_CHECKING:
+    from xplanes.training.module import RadianceModule
 
 ELEVATION = 20.0
 """Elevation of the orbiting camera, in degrees."""
@@ -268,7 +270,7 @@ def back_and_forth(count: int) -> Tensor:
     return 1 - (2 * torch.arange(count) / max(count, 1) - 1).abs()
 
 
-def write_run_video(module: RadianceModule, scene: Scene, run: Path) -> Path:
+def write_run_video(module: "RadianceModule", scene: Scene, run: Path) -> Path:
     """Write media/video.webp, see `RunVideo`."""
     frame, views = module.frame, scene.splits["train"]
     assert frame is not None

@@ -7,7 +7,7 @@ the canonical camera of the Large Reconstruction Model.
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -23,8 +23,9 @@ from xplanes.rendering.base import RayRenderer
 from xplanes.scenes.cameras import PosedCamera, camera_around
 from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame, frame_content
 from xplanes.scenes.views import Intrinsics, Scene, Views
-from xplanes.training.fit import fit_quietly
-from xplanes.training.module import RadianceModule
+
+if TYPE_CHECKING:
+    from xplanes.training.module import RadianceModule
 
 OBLONG = 0.01
 """Largest relative difference of the two focal lengths: LRMs expect square pixels."""
@@ -301,7 +302,7 @@ def trained_field(
     steps: int,
     seconds: float | None,
     advice: str,
-) -> RadianceModule:
+) -> "RadianceModule":
     """Train a field for a short time; an interrupted training is resumed.
 
     Args:
@@ -316,6 +317,10 @@ def trained_field(
     Raises:
         TrainingError: If the loss is not finite.
     """
+    # Imported here because Lightning's import takes long, and settings need no training.
+    from xplanes.training.fit import fit_quietly
+    from xplanes.training.module import RadianceModule
+
     module = RadianceModule(method)
     module.build(place.scene, place.frame, device=place.device, say=place.say)
     module.advice = advice
@@ -332,7 +337,7 @@ def trained_field(
 
 @torch.no_grad()
 def _render(
-    module: RadianceModule,
+    module: "RadianceModule",
     frame: Frame,
     pose: Tensor,
     focal: float,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from xplanes import __version__
+from xplanes.backend import find_device
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.files import read_json
@@ -15,7 +16,6 @@ from xplanes.scenes.datamodule import SceneDataModule, found_root
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene, Views
 from xplanes.training.checkpoints import load_checkpoint
-from xplanes.training.fit import find_device
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import read_config, require_same_views
 

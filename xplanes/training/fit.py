@@ -14,7 +14,7 @@ import torch
 from lightning.pytorch.callbacks import Callback, ProgressBar, StochasticWeightAveraging
 from lightning.pytorch.plugins.io import CheckpointIO
 
-from xplanes.backend import cpu_loops, synchronize
+from xplanes.backend import cpu_loops, find_device, synchronize
 from xplanes.errors import ConfigError
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.behind import background_colour
@@ -152,23 +152,6 @@ class Trainer(lightning.Trainer):
                 self.test(module, data, verbose=False)
         by_file = {score.file: score for score in module.scores}
         return [by_file[file] for file in views.files if file in by_file]
-
-
-def find_device(accelerator: str) -> torch.device:
-    """The device of ``trainer.accelerator``; auto: a CUDA GPU if there is one, else the CPU.
-
-    Raises:
-        ConfigError: If a GPU is requested but not found, or for another accelerator.
-    """
-    if accelerator not in ("auto", "cpu", "gpu", "cuda"):
-        raise ConfigError(f"accelerator={accelerator}: must be one of auto, cpu, gpu")
-    if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
-        raise ConfigError(
-            f"accelerator={accelerator}: no GPU found; set trainer.accelerator=cpu or auto"
-        )
-    if accelerator == "cpu" or not torch.cuda.is_available():
-        return torch.device("cpu")
-    return torch.device("cuda")
 
 
 def fit_quietly(

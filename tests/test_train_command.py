@@ -26,6 +26,7 @@ from xplanes import run as whole_run
 from xplanes.components import build
 from xplanes.config import CONF, compose_plain, quoted, unquoted, with_names
 from xplanes.errors import ConfigError
+from xplanes.files import StorageError
 from xplanes.launch import SettingsCheck, prepare
 from xplanes.locks import alone_in, in_turn
 from xplanes.process import resume_command
@@ -134,6 +135,31 @@ def test_auto_finds_runs_whatever_was_said_to_hydra(tmp_path, monkeypatch):
     own = ["seed=1", "hydra.searchpath=[file://groups]", "hydra.output_subdir=null"]
     assert prepare([*own, "resume=auto"])[-1].startswith("resume=outputs")
     assert prepare([own[0], own[2], "resume=auto"])[-1] == "resume=null"
+    # Hydra's own option for a folder of settings is recorded as the override that it stands for.
+    for option in (["--config-dir", "my groups"], ["--config-dir=my groups"], ["-cd", "my groups"]):
+        said = f"hydra.searchpath=['file://{tmp_path}/my groups']"
+        (run / "overrides.txt").write_text(f"{said}\nseed=1\n")
+        assert prepare([*option, "seed=1"]) == ["seed=1", said]
+        assert prepare([*option, "seed=1", "resume=auto"])[-1].startswith("resume=outputs")
+
+
+def test_a_resumed_run_may_change_options_that_it_added(tmp_path):
+    added = ("+losses.a._target_=tests.plugins.Dark", "+losses.a.weight=0.1", "++seed=3")
+    (tmp_path / "overrides.txt").write_text("\n".join(added) + "\n")
+    new = ["losses.a.weight=0.2", "seed=4", "trainer.max_steps=9"]
+    found = prepare([f"resume={tmp_path}", *new])
+    assert found[:4] == [added[0], "+losses.a.weight=0.2", "++seed=4", "trainer.max_steps=9"]
+
+
+@pytest.mark.parametrize("option", [["--help"], ["--cfg", "job"], ["--cfg=job"], ["-i"]])
+def test_options_that_only_show_something_need_no_folder_to_write(tmp_path, monkeypatch, option):
+    def refuse(path):
+        raise StorageError("cannot be written")
+
+    monkeypatch.setattr(launch, "require_writable", refuse)
+    assert prepare(option) == option
+    with pytest.raises(StorageError):
+        prepare(["seed=1"])
 
 
 def test_a_sweep_does_not_take_other_jobs_for_its_own(tmp_path):
@@ -257,6 +283,8 @@ def test_home_is_expanded(monkeypatch, tmp_path):
     assert with_names("resume=~nobody-has-this-name") == "resume='~nobody-has-this-name'"
     assert with_names("resume=~/runs/a") == f"resume={tmp_path}/runs/a"
     assert with_names("data.scene=~/a,~/b", several=True) == f"data.scene={tmp_path}/a,{tmp_path}/b"
+    quoted_already = '''data.scene='a, b',"c, d"'''
+    assert with_names(f"{quoted_already},e f", several=True) == f"{quoted_already},'e f'"
     data = SceneDataModule.compose("data=blender", "data.root='~/a'", "data.scene=b")
     assert data.settings.folder == tmp_path / "a" / "b"
     plain = compose_plain("train", ["data=colmap"])["data"]

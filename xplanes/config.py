@@ -22,6 +22,9 @@ NAMES = (
 )
 """Settings whose values are names or paths, even if they look like numbers or lists."""
 
+UNQUOTED_COMMA = re.compile(r""",(?=(?:[^'"]|'[^']*'|"[^"]*")*$)""")
+"""A comma between values."""
+
 ELSEWHERE = {
     "gpus": "trainer=ddp trainer.devices={}",
     "lr": "model.plane_lr={}",
@@ -173,15 +176,19 @@ def with_names(override: str, *, several: bool = False) -> str:
     key, equals, value = override.partition("=")
     if not equals or key.lstrip("+~") not in NAMES:
         return override
-    is_quoted = value[:1] in ("'", '"') and value[:1] == value[-1:]
-    if is_quoted or "${" in value or value.lower() in ("", "null"):
+    if (_is_quoted(value) and not several) or "${" in value or value.lower() in ("", "null"):
         return override
     if "(" in value and re.fullmatch(r"(choice|range|interval|glob|sort|shuffle)\(.*\)", value):
         return override
     if "," in value and not several and key.lstrip("+~") == "data.scene":
         return override  # Hydra's own error says that a list of scenes needs --multirun.
-    parts = value.split(",") if several else [value]
-    return f"{key}={','.join(quoted(at_home(part)) for part in parts)}"
+    parts = UNQUOTED_COMMA.split(value) if several else [value]
+    parts = [part if _is_quoted(part) else quoted(at_home(part)) for part in parts]
+    return f"{key}={','.join(parts)}"
+
+
+def _is_quoted(value: str) -> bool:
+    return value[:1] in ("'", '"') and value[:1] == value[-1:]
 
 
 def near_names(overrides: Sequence[str], name: str | None = "train") -> str:

@@ -34,6 +34,12 @@ from xplanes.process import STARTED, train_command
 
 SEARCHPATH = "hydra.searchpath"
 
+SHOWING = {
+    *("--help", "-h", "--hydra-help", "--version", "--cfg", "-c", "--info", "-i"),
+    *("--shell-completion", "-sc"),
+}
+"""Hydra's options that show something instead of running a job."""
+
 FORMER = {
     "figure3": "sweep=rank data.scene=hook,lego lrm=xlarge",
     "figures5_7_9_10": "sweep=table1",
@@ -209,6 +215,7 @@ def prepare(arguments: list[str]) -> list[str]:
         StorageError: If the folder of the run cannot be written.
     """
     require_readable(arguments)
+    arguments = _with_searchpath(arguments)
     mode = dict(map(key_and_value, arguments)).get("hydra.mode")
     several = mode == "MULTIRUN" or not {"-m", "--multirun"}.isdisjoint(arguments)
     _require_present_names(arguments, several=several)
@@ -222,6 +229,8 @@ def prepare(arguments: list[str]) -> list[str]:
             raise ConfigError(f"{key}={value}: must be one of {known}")
     resume, folder = values.get("resume", "null"), values.get("hydra.run.dir")
     if resume in ("null", "", "None", "auto"):
+        if not SHOWING.isdisjoint(text.partition("=")[0] for text in arguments):
+            return arguments
         # Checked before Hydra makes the folder, because it would fail with a traceback.
         place = values.get("hydra.sweep.dir") if several else folder
         require_writable(Path(place or "outputs"))
@@ -243,6 +252,22 @@ def prepare(arguments: list[str]) -> list[str]:
     return _resumed(Path(resume), arguments)
 
 
+def _with_searchpath(arguments: list[str]) -> list[str]:
+    """Arguments with Hydra's option ``--config-dir`` as an override, which a run records."""
+    keys = {key_and_value(text)[0] for text in arguments}
+    found, folder = [], None
+    words = iter(arguments)
+    for word in words:
+        option, equals, value = word.partition("=")
+        if option in ("--config-dir", "-cd"):
+            folder = value if equals else next(words, "")
+        else:
+            found.append(word)
+    if not folder or SEARCHPATH in keys:
+        return arguments
+    return [*found, f"{SEARCHPATH}=[{quoted(f'file://{Path(folder).absolute()}')}]"]
+
+
 def _resumed(run: Path, arguments: list[str]) -> list[str]:
     """A run's overrides, the new ones that replace or extend them, and its folder."""
     path = run / "overrides.txt"
@@ -262,6 +287,13 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
         )
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
     changed = {key for key, _ in map(key_and_value, new) if key}
+    # Options that the run added with a plus sign are not in the configuration without it.
+    added = {
+        key_and_value(line)[0]: "++" if line.startswith("++") else "+"
+        for line in text.splitlines()
+        if line.startswith("+")
+    }
+    new = [a if a[:1] in "+~" else added.get(key_and_value(a)[0], "") + a for a in new]
     old = [line for line in text.splitlines() if line and key_and_value(line)[0] not in changed]
     try:
         _require_present_names(old, several=False)

@@ -122,3 +122,13 @@ def test_one_view_and_views_out_of_order_work():
     shuffled = views.subset(torch.randperm(20, generator=torch.Generator().manual_seed(0)))
     assert torch.equal(carved(views).allowed, carved(shuffled).allowed)
     assert torch.equal(carved(views).occupied, carved(shuffled).occupied)
+
+
+def test_silhouettes_from_wrong_poses_rule_nothing_out_for_good():
+    views = ball_views(12, 0.5)
+    exact, wrong = (OccupancyGrid(16, 1, step=0.02) for _ in range(2))
+    for grid, known in ((exact, True), (wrong, False)):
+        carve(grid, views, cube_frame(1.4, ORIGIN), exact=known)
+    assert torch.equal(exact.occupied, wrong.occupied)
+    assert not exact.allowed.all()
+    assert wrong.allowed.all()

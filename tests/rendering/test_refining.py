@@ -13,6 +13,7 @@ from xplanes import RadianceModule
 from xplanes.errors import ConfigError
 from xplanes.rendering import refining
 from xplanes.rendering.base import Rendering
+from xplanes.rendering.marching import Samples
 from xplanes.rendering.refining import CameraCorrections, rotations, without_common
 from xplanes.run import run
 from xplanes.scenes.batches import RayBatches, ViewBatches, ViewSettings
@@ -197,7 +198,37 @@ def test_rays_that_say_nothing_move_nothing():
         cameras.observe(drawn, Rendering(colour, blank, blank, blank, None))  # pyright: ignore
         cameras.solve()
         assert torch.equal(cameras.motion, torch.zeros(4, 6))
-        assert torch.equal(cameras.steepness, torch.zeros(4, 6, 6).double())
+
+
+def test_rays_without_slots_for_their_samples_do_not_count():
+    views = views_of(surrounding(4, 4.0))
+    cameras = CameraCorrections(CameraGroups.of(views, FRAME))
+    rays = batches_of(views).draw(0)
+    colour, opacity, depth = ball(rays["origins"], rays["directions"])
+    none = torch.empty(0, dtype=torch.int64)
+    left_out = torch.zeros(len(colour), dtype=torch.bool)
+    samples = Samples(none, none, torch.empty(0, 3), none, none, 0, 0, 0, shown=left_out)
+    cameras.observe(rays, Rendering(1 - colour, opacity, depth, torch.empty(0), samples))
+    assert not cameras.steepness.any()
+    assert not cameras.residual.any()
+
+
+def test_cameras_that_few_rays_show_are_corrected_in_the_end():
+    """Between two corrections each of them gets fewer rays than it needs."""
+    truth = surrounding(60, 4.0)
+    views = replace(views_of(truth), camera_to_world=disturbed(truth, 1.0))
+    batches = batches_of(views, rays=512)
+    cameras = CameraCorrections(CameraGroups.of(views, FRAME))
+    observed = []
+    for step in range(120):
+        rays = cameras.corrected_rays(batches.draw(step))
+        seen = ball(rays["origins"], rays["directions"])
+        cameras.observe(rays, Rendering(*seen, torch.empty(0), None))  # pyright: ignore
+        if step % 4 == 3:
+            observed.append(float(cameras.rays.max()))
+            cameras.solve()
+    assert observed[0] < refining.LEAST_RAYS
+    assert (cameras.moved > 0).all()
 
 
 def test_slopes_are_those_of_the_colours():

@@ -107,9 +107,9 @@ def test_neither_the_video_nor_other_views_show_what_is_held_out():
     assert data.scene.video is None, "all of it is held out"
 
 
-def test_as_many_views_are_held_out_as_are_scored_at_most():
+def test_how_many_views_are_scored_does_not_change_what_is_trained_on():
     held_out = {}
-    for most, counts in ((None, (35, 5)), (2, (38, 2))):
+    for most, counts in ((None, (35, 5)), (2, (35, 2))):
         data = SceneDataModule.of(ball_scene(count=40))
         data.settings = replace(data.settings, eval_views=most or data.settings.eval_views)
         data.setup("fit")
@@ -173,3 +173,30 @@ def test_processes_share_the_views():
     # Lightning scores nothing in a process without a view, for which the others would wait.
     data.trainer = SimpleNamespace(global_rank=len(whole), world_size=len(whole) + 1)
     assert [batch["index"] for batch in data.val_dataloader()] == whole[:1]
+
+
+def test_each_module_gets_batches_of_its_own_frame_and_settings():
+    data = SceneDataModule.of(ball_scene(), seed=3)
+    for frame, settings in ((FRAME, RAYS), (scene_frame(data.scene.splits["train"]), RAYS)):
+        module = SimpleNamespace(ray_settings=settings, frame=frame)
+        expected = RayBatches(data.scene.splits["train"], frame, settings, seed=3)
+        assert same(data.batches_for(module, 0).draw(0), expected.draw(0))
+    other = replace(RAYS, per_batch=16)
+    assert data.batches_for(SimpleNamespace(ray_settings=other, frame=FRAME), 0).rays == 16
+
+
+def test_what_a_test_will_score_is_not_trained_on():
+    """Even if nothing is scored during training."""
+    train = ball_scene(count=16).splits["train"]
+    data = SceneDataModule.of(replace(ball_scene(), splits={"train": train}))
+    data.trainer = SimpleNamespace(limit_val_batches=0, lightning_module=None)
+    data.setup("fit")
+    trained = set(data.scene.splits["train"].files)
+    data.setup("test")
+    assert not trained & set(data.scene.splits[data.test_split].files)
+    assert len(trained) == 14
+
+
+def test_the_seed_of_the_overrides_draws_the_rays():
+    assert SceneDataModule.compose("data=blender", "data.scene=x", "seed=7").seed == 7
+    assert SceneDataModule.compose("data=blender", "data.scene=x", "seed=7", seed=8).seed == 8

@@ -26,7 +26,7 @@ from xplanes.errors import ConfigError
 from xplanes.fields import Decoder, XPlanes
 from xplanes.fields.background import Background
 from xplanes.fields.base import ViewDependentField
-from xplanes.fields.xplanes import random_planes
+from xplanes.fields.xplanes import FINE_PLANES, random_planes
 from xplanes.optional import MissingExtraError
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.behind import background_colour
@@ -264,19 +264,22 @@ def written_reader(name: str = "Planes") -> Any:
     return names[name]
 
 
-def x_planes(plane_set: str, **parts: Any) -> XPlanes:
+def x_planes(plane_set: str, *, fine: bool = False, **parts: Any) -> XPlanes:
     """A small field with random planes."""
     size = {"channels": 5, "resolution": 9, "time_resolution": 4}
     random = {"space_scale": 1, "time_scale": 1, "generator": torch.Generator().manual_seed(0)}
     made = random_planes(plane_set, **size, **random)
+    if fine:
+        made |= {name: torch.randn(3, 17, 17) for name in FINE_PLANES}
     return XPlanes(planes=made, plane_set=plane_set, **parts)
 
 
-@pytest.mark.parametrize("plane_set", ["three", "six", "nine"])
+@pytest.mark.parametrize("plane_set", ["three", "six", "nine", "six, fine"])
 def test_the_documented_reader_gives_the_values_of_the_field(tmp_path, plane_set):
     options: dict[str, Any] = {"activation": "silu", "density": "exp", "density_scale": 3.0}
     options = {} if plane_set == "six" else options | {"colour_margin": 0.0}
-    field = x_planes(plane_set, decoder=Decoder(5, width=16, **options))
+    plane_set, _, fine = plane_set.partition(", ")
+    field = x_planes(plane_set, fine=bool(fine), decoder=Decoder(5, width=16, **options))
     trained = set_up(tmp_path, field)
     folder = export(trained, ExportOptions(what="planes"))
     world = FRAME.to_world(torch.rand(200, 3) * 2.2 - 1.1)

@@ -183,6 +183,12 @@ def test_the_model_card_has_scores_command_and_licence(trained_run, tmp_path):
     assert "licence CC-BY-NC-4.0" in text
     assert "bundled with X-Planes (MIT licence)" in card_with(name="tiny", bundled="tiny")[1]
     assert metrics["lrm"] == {}
+
+    # A sweep's own option cannot be repeated for one run.
+    (run / "overrides.txt").write_text("sweep=table1\nmodel=six_planes\n")
+    text = card_of(run)[1]
+    assert "as a run of `sweep=table1`" in text
+    assert "xplanes train" not in text
     assert "random initialisation" in card_with(name="auto", bundled="tiny")[1]
 
 

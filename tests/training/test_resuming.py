@@ -21,7 +21,7 @@ from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.tools.runs import load_run
 from xplanes.training import scores
-from xplanes.training.checkpoints import AtomicCheckpointIO
+from xplanes.training.checkpoints import AtomicCheckpointIO, load_checkpoint
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import KEPT, RunRecord, require_same_run
 
@@ -223,3 +223,11 @@ def test_a_missing_split_is_held_out_of_training_or_nothing_is_the_best(
         alone = SceneDataModule(data)
         alone.setup("test")
         assert len(alone.scene.splits["val"]) == 2
+
+
+def test_a_missing_best_checkpoint_is_explained(trained_run, tmp_path):
+    with pytest.raises(ConfigError, match="stopped before its first checkpoint"):
+        load_checkpoint(tmp_path / "best.ckpt")
+    shutil.copy(trained_run / "checkpoints" / "last.ckpt", tmp_path)
+    with pytest.raises(ConfigError, match=r"no validation scores.*--checkpoint last"):
+        load_checkpoint(tmp_path / "best.ckpt")

@@ -274,7 +274,7 @@ def write_run_video(module: "RadianceModule", scene: Scene, run: Path) -> Path:
     """Write media/video.webp, see `RunVideo`."""
     frame, views = module.frame, scene.splits["train"]
     assert frame is not None
-    video = RunVideo.of(scene, frame)
+    video = RunVideo.of(module.corrected_scene(scene), frame)
     first = video.cameras[0]
     shown = [pixels_with_rays(views, index, first.height, first.width) for index in video.path]
     options = {"background": scene.background, "shown": shown or None}

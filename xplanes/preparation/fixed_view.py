@@ -243,9 +243,11 @@ def _rendered(
         train.identity,
         train.camera_to_world,
         train.times,
+        train.ignored,
         intrinsics_key(train.intrinsics),
         frame_content(own_frame),
         rendering.model.plain(),
+        place.scene.refine_cameras,
         [method.seed, options.fixed_view_seconds, options.fixed_view_steps],
         [pose, focal, side, count],
     ]

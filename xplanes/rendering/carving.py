@@ -12,7 +12,7 @@ CHUNK = 2**17
 """Points that are projected together, for up to 512 views; fewer for more views."""
 
 
-def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
+def carve(grid: OccupancyGrid, views: Views, frame: Frame, *, exact: bool = True) -> None:
     """Empty the cells that lie outside the silhouettes of the training views.
 
     A cell that a view shows to be empty at its own time is excluded permanently. A cell that only
@@ -23,6 +23,7 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
         grid: Changed in place.
         views: Training views; without alpha nothing is emptied.
         frame: The field's frame.
+        exact: Whether the poses are right. If not, no cell is excluded permanently.
     """
     if views.is_opaque:
         return
@@ -42,7 +43,8 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
         for index, cover in enumerate(covers):
             likely[index, part] = joined[cover].any(dim=0)
             allowed[index, part] = (joined if views.is_static else alone)[cover].any(dim=0)
-    grid.allow(allowed)
+    if exact:
+        grid.allow(allowed)
     grid.presume(likely)
 
 

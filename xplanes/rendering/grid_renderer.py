@@ -305,7 +305,7 @@ class OccupancySettings(SamplerSettings):
         fill_seconds = 0.0
         if site.views is not None:
             if self.silhouettes:
-                carve(grid, site.views, site.frame)
+                carve(grid, site.views, site.frame, exact=site.cameras is None)
             if site.initialised and self.fill:
                 fill_seconds = _fill(renderer, field, site)
         settings = (

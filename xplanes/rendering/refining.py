@@ -107,6 +107,9 @@ class CameraCorrections(nn.Module):
         moved: Root mean square displacement of each camera's image, in pixels. [C]
     """
 
+    own = ("steepness", "residual", "pixels", "rays")
+    """Buffers that each process of a distributed run has for itself."""
+
     index: Tensor
     places: Tensor
     given: Tensor
@@ -126,8 +129,9 @@ class CameraCorrections(nn.Module):
         self.register_buffer("given", groups.poses, persistent=False)
         self.register_buffer("motion", torch.zeros(count, 6))
         self.register_buffer("moved", torch.zeros(count))
-        # Sums over the rays since the last correction: squares of the derivatives of colours, their
-        # products with differences of colours, squares of displacements in pixels, and opacities.
+        # Sums over the rays since a camera's last correction: squares of the derivatives of
+        # colours, their products with differences of colours, squares of displacements in pixels,
+        # and opacities.
         self.register_buffer("steepness", torch.zeros(count, 6, 6, dtype=exact))
         self.register_buffer("residual", torch.zeros(count, 6, dtype=exact))
         self.register_buffer("pixels", torch.zeros(count, 6, 6, dtype=exact))
@@ -157,7 +161,6 @@ class CameraCorrections(nn.Module):
         """
         origins, directions = rays["origins"], rays["directions"]
         opacity = rendering.opacity.clamp(0, 1)
-        # The depth is a sum weighted by opacity.
         near = opacity / rendering.depth.clamp(min=1e-3)
         inverse = near + (1 - opacity) / (origins.norm(dim=-1) + BEHIND)
         difference = rays["target"] - rendering.colour
@@ -174,6 +177,9 @@ class CameraCorrections(nn.Module):
         # A lens may have no ray for the next pixel, and a field may return NaN.
         usable = (difference.isfinite().all(dim=-1) & inverse.isfinite())[:, None]
         usable &= area > LEAST_AREA * across * along
+        shown = getattr(rendering.samples, "shown", None)
+        if shown is not None:  # Other rays had no slots for their samples.
+            usable &= shown[:, None]
         difference = torch.where(usable, difference, 0)
         inverse = torch.where(usable, inverse[:, None], 0)[:, None]
         to_pixels = torch.where(usable[:, None], to_pixels, 0)
@@ -192,7 +198,10 @@ class CameraCorrections(nn.Module):
 
     @torch.no_grad()
     def solve(self) -> None:
-        """Correct the cameras from the observations since the last correction, and clear these."""
+        """Correct the cameras that enough rays have observed since their last correction.
+
+        Their observations are cleared; those of the others are kept until they suffice.
+        """
         sums = (self.steepness, self.residual, self.pixels, self.rays)
         if in_group():
             for each in sums:  # Each process has its own rays.
@@ -213,8 +222,9 @@ class CameraCorrections(nn.Module):
         motion = without_common(self.places.double(), motion, metric, known)
         self.motion.copy_(motion)
         self.moved.copy_(torch.where(known, _displacement(motion, metric), self.moved))
-        for each in sums:
-            each.zero_()
+        first = not in_group() or distributed.get_rank() == 0
+        for each in sums:  # The first process keeps what is left of all of them.
+            each[known if first else slice(None)] = 0
 
     def corrected(self, poses: Tensor, frame: Frame) -> Tensor:
         """Poses in the world, those of training cameras corrected. [V, 4, 4]

@@ -131,8 +131,8 @@ class BatchSettings(Settings, ABC):
 class RaySettings(BatchSettings):
     """Settings of ray batches."""
 
-    # Maximum rays per batch. auto: 1365 on the CPU; 32768 on a GPU, where the schedules of X-Planes
-    # and of the occupancy grid are shortened to 1/24.
+    # Maximum rays per batch. auto: 1365 on the CPU; 32768 on a GPU, where most schedules in steps
+    # are shortened to 1/24.
     per_batch: Count | Literal["auto"]
     # Maximum samples per batch, on average. auto: 8192 on the CPU, 524288 on a GPU.
     samples_per_batch: Count | Literal["auto"]

@@ -17,7 +17,7 @@ from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError
 from xplanes.files import read_json
 from xplanes.scenes.batches import Batch, Batches, DeviceBatches, RayBatches, RaySettings
-from xplanes.scenes.frame import scene_frame
+from xplanes.scenes.frame import Frame, scene_frame
 from xplanes.scenes.listing import held_out_places
 from xplanes.scenes.source import HELD_OUT, SceneSettings, may_hold_out
 from xplanes.scenes.views import Scene, Views, spread
@@ -77,7 +77,7 @@ class SceneDataModule(LightningDataModule):
         self.held_out = 0
         """Number of training views held out for validation, if the scene has no split for it."""
         self._scene: Scene | None = None
-        self._batches: dict[int, Batches] = {}
+        self._batches: dict[int, tuple[Frame | None, Any, Batches]] = {}
 
     @property
     def _module(self) -> Any:
@@ -108,18 +108,19 @@ class SceneDataModule(LightningDataModule):
         return data
 
     @classmethod
-    def compose(cls, *overrides: str, seed: int = 0) -> "SceneDataModule":
+    def compose(cls, *overrides: str, seed: int | None = None) -> "SceneDataModule":
         """Build from command-line overrides: ``compose("data=dnerf", "data.scene=hook")``.
 
         Args:
             *overrides: ``key=value`` each; ``plugins=[MODULE]`` allows classes of your own modules.
-            seed: Seed for drawing rays.
+            seed: Seed for drawing rays; that of the overrides when None.
 
         Raises:
             ConfigError: If a setting does not exist or is invalid.
         """
         config = compose_plain("train", overrides)
-        return cls(config["data"], seed=seed, plugins=config["plugins"] or ())
+        own = config["seed"] if seed is None else seed
+        return cls(config["data"], seed=own, plugins=config["plugins"] or ())
 
     @classmethod
     def from_run(cls, run: str | Path, plugins: Sequence[str] = ()) -> "SceneDataModule":
@@ -158,7 +159,7 @@ class SceneDataModule(LightningDataModule):
 
     @scene.setter
     def scene(self, scene: Scene) -> None:
-        self._scene = scene
+        self._scene, self._batches = scene, {}
 
     def prepare_data(self) -> None:
         self.settings.prepare()
@@ -169,10 +170,12 @@ class SceneDataModule(LightningDataModule):
             # Each module continues its own count of batches.
             self.first = getattr(self._module, "batches", self.first)
         scores = self.trainer is None or self.trainer.limit_val_batches
-        if stage in ("fit", "validate") and scores:
+        if stage in ("fit", "validate"):
             if (split := self.validation_split) is None:
-                self._hold_out()
-            else:
+                # Views that a test will score must not be trained on, either.
+                if scores or "test" not in self.scene.splits:
+                    self._hold_out()
+            elif scores:
                 self.read_split(split)
         if stage in ("test", "predict"):
             if not {"test", "val"} & self.scene.splits.keys():
@@ -211,13 +214,13 @@ class SceneDataModule(LightningDataModule):
         if not may_hold_out(train):
             return
         times, order = train.times.sort(stable=True)
-        places = held_out_places(times.tolist(), HELD_OUT)
-        if (most := self.settings.eval_views) is not None:
-            places = [places[rank] for rank in spread(most, len(places))]
         chosen = torch.zeros(len(train), dtype=torch.bool)
-        chosen[order[places]] = True
+        chosen[order[held_out_places(times.tolist(), HELD_OUT)]] = True
         train, val = (train.subset(part.nonzero()[:, 0]) for part in (~chosen, chosen))
         shared = {*val.files}
+        # How many are scored must not change what is trained on.
+        if (most := self.settings.eval_views) is not None:
+            val = val.subset(spread(most, len(val)))
         self._scene = replace(
             self.scene,
             splits=self.scene.splits | {"train": train, "val": val},
@@ -237,15 +240,17 @@ class SceneDataModule(LightningDataModule):
 
     def batches_for(self, module: Any, rank: int) -> Batches:
         """The batches of a process for a LightningModule, which may specify them."""
-        if rank not in self._batches:
+        own, settings = getattr(module, "frame", None), getattr(module, "ray_settings", UNIFORM)
+        known = self._batches.get(rank)
+        # Another module may have another frame or other settings.
+        if known is None or known[0] is not own or known[1] != settings:
             views = self.scene.splits["train"]
-            frame = getattr(module, "frame", None)
-            frame = frame or scene_frame(views, self.settings.hints(self.scene))
-            settings = getattr(module, "ray_settings", UNIFORM)
-            self._batches[rank] = settings.batches(views, frame, seed=self.seed, rank=rank)
+            frame = own or scene_frame(views, self.settings.hints(self.scene))
+            batches = settings.batches(views, frame, seed=self.seed, rank=rank)
             if self.scene.refine_cameras:
-                self._batches[rank].add_slopes()
-        return self._batches[rank]
+                batches.add_slopes()
+            self._batches[rank] = known = own, settings, batches
+        return known[2]
 
     def train_dataloader(self) -> DataLoader:
         batches = self.batches(self.trainer.global_rank if self.trainer else 0)

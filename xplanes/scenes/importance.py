@@ -99,12 +99,15 @@ class ErrorMap:
         """Sums of squared errors and their number: of all processes until the last update, then
         of this process since it; empty before the first batch. [2, 2, MOST_TILES]"""
 
-    def observe(self, batch: Mapping[str, Any], colour: Tensor) -> None:
+    def observe(
+        self, batch: Mapping[str, Any], colour: Tensor, shown: Tensor | None = None
+    ) -> None:
         """Add the errors of a rendered batch, if it has tiles.
 
         Args:
             batch: With ``tile``, int64 [R], and ``target`` [R, 3].
             colour: Colours of its rays. [R, 3]
+            shown: Rays that count; all when None. bool [R]
         """
         if (tile := batch.get("tile")) is None:
             return
@@ -114,8 +117,9 @@ class ErrorMap:
         if self._sums.device != error.device:
             self._sums = self._sums.to(error.device)
         fresh = self._sums[1]
-        fresh[0].index_add_(0, tile, error)
-        fresh[1].index_add_(0, tile, torch.ones_like(error))
+        counted = torch.ones_like(error) if shown is None else shown.to(error)
+        fresh[0].index_add_(0, tile, torch.where(counted > 0, error, 0))
+        fresh[1].index_add_(0, tile, counted)
         self.batches += 1
         if self.batches % REFRESH == 0:
             if in_group():

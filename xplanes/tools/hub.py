@@ -165,7 +165,10 @@ def model_card(run: Path, repository: str) -> str:
     table = "".join(f"| {name} | {value:.4g} |\n" for name, value in scores.items())
     video = metrics.get("media")
     picture = f"![Video]({video})\n\n" if video and (run / video).is_file() else ""
-    overrides = shlex.join((run / "overrides.txt").read_text(encoding="utf-8").splitlines())
+    overrides = (run / "overrides.txt").read_text(encoding="utf-8").splitlines()
+    command = f"with\n\n    xplanes train {shlex.join(overrides)}"
+    if sweep := next((text for text in overrides if text.startswith("sweep=")), None):
+        command = f"as a run of `{sweep}`, with the settings in `config.yaml`."
     return f"""---
 {card.to_yaml()}
 ---
@@ -180,9 +183,7 @@ A dynamic radiance field of the scene {scene}, model {model["name"]}, trained wi
 {table}
 {_weights(lrm, used=bool(metrics["lrm"]))}
 
-Trained for {metrics["step"]:,} steps with
-
-    xplanes train {overrides}
+Trained for {metrics["step"]:,} steps {command}
 
 To use it:
 

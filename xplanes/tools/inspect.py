@@ -72,6 +72,7 @@ class Capture:
         images: Statistics of the pixels of each split's images.
         findings: Possible problems.
         texels: Texels along an axis of the planes; None for fields without planes.
+        pixels_per_texel: Pixels of training images that a texel covers; None without planes.
     """
 
     choice: Choice
@@ -81,6 +82,7 @@ class Capture:
     images: Mapping[str, list[ImageFacts]]
     findings: tuple[Finding, ...]
     texels: int | None
+    pixels_per_texel: float | None
 
 
 @dataclass(frozen=True)
@@ -210,18 +212,18 @@ def inspect(choice: Choice) -> Capture:
     }
     findings = [Finding("files", text) for text in said]
     findings += [*camera_findings(scene, frame), *image_findings(scene, images)]
-    texels = None
+    texels = per_texel = None
     if frame is not None:
-        pixels = pixels_across(train, frame)
-        texels = model.texels(pixels_of_detail(train, frame, scene.is_surrounded))
+        width = _width_of_training(choice, scene) or train.width
+        share = width / train.width
+        texels = model.texels(share * pixels_of_detail(train, frame, scene.is_surrounded))
         if texels is not None:
-            width = _width_of_training(choice, scene) or train.width
-            per_texel = pixels / texels * width / train.width
+            per_texel = share * pixels_across(train, frame) / texels
             fine = getattr(model, "fine", None) is not None
             findings += texel_findings(per_texel, width, texels, fine=fine)
     follows = {kind for each in findings for kind in CONSEQUENCES.get(each.kind, ())}
     findings = [each for each in findings if each.kind not in follows]
-    return Capture(choice, scene, frame, problem, images, tuple(findings), texels)
+    return Capture(choice, scene, frame, problem, images, tuple(findings), texels, per_texel)
 
 
 def cameras_of(views: Views) -> list[CameraGroup]:
@@ -320,7 +322,7 @@ def facts(capture: Capture) -> dict[str, Any]:
         "notes": dict(scene.notes),
         "cube": None,
         "texels": capture.texels,
-        "pixels_per_texel": None,
+        "pixels_per_texel": capture.pixels_per_texel,
         "bytes": sum(views.nbytes for views in scene.splits.values()),
         "warnings": [{"kind": each.kind, "text": each.text} for each in capture.findings],
         "error": capture.problem or None,
@@ -335,8 +337,6 @@ def facts(capture: Capture) -> dict[str, Any]:
             "source": frame.source,
             "camera_distance": [float(away.min()), float(away.median()), float(away.max())],
         }
-        if capture.texels is not None:
-            content["pixels_per_texel"] = pixels_across(train, frame) / capture.texels
     return content
 
 

@@ -145,11 +145,7 @@ def load_run(
     except ConfigError as error:
         raise ConfigError(f"{path} cannot be used: {error}") from error
     module.to(device).eval()
-    splits = {
-        name: replace(views, camera_to_world=module.corrected(views.camera_to_world))
-        for name, views in scene.splits.items()
-    }
-    scene = replace(scene, splits=splits)
+    scene = module.corrected_scene(scene)
     assert module.frame is not None
     return TrainedRun(
         run, replace(experiment, data=data), scene, name, module.frame, module, checkpoint, step

@@ -174,7 +174,7 @@ def find_resumable(folder: Path) -> Path | None:
         try:
             step = load_checkpoint(best)["global_step"]
         except (ConfigError, KeyError, TypeError):
-            raise ConfigError(f"{problem}; or delete {last} to start again") from problem
+            raise ConfigError(f"{problem}; to start again, delete {last}") from problem
         logger.warning("%s. Continuing from %s, step %d", problem, best, step)
         with replacing(last) as temporary:
             shutil.copyfile(best, temporary)
@@ -187,7 +187,13 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         ConfigError: If the file is missing, cannot be read, is damaged, or holds more than data.
     """
+    beside = path.with_name(BEST if path.name == LAST else LAST)
     if not path.is_file():
+        if path.name == BEST and beside.is_file():
+            raise ConfigError(
+                f"{path} does not exist: no validation scores have chosen a best step; take {LAST} "
+                "(--checkpoint last)"
+            )
         raise ConfigError(
             f"{path} does not exist: the run stopped before its first checkpoint "
             "(callbacks.checkpoints.every)"
@@ -212,7 +218,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     except Exception as error:
         raise ConfigError(
             f"{path} cannot be read ({type(error).__name__}: {str(error).split('. ')[0]}): it is "
-            f"damaged; try {BEST if path.name == LAST else LAST} beside it"
+            f"damaged{f'; try {beside.name} beside it' if beside.is_file() else ''}"
         ) from error
 
 

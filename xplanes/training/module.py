@@ -4,6 +4,7 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -239,6 +240,14 @@ class RadianceModule(ViewScoring):
         frame = self.frame
         return poses if frame is None else self.sampler.corrected(poses, frame)
 
+    def corrected_scene(self, scene: Scene) -> Scene:
+        """A scene with the poses that training has corrected."""
+        splits = {
+            name: replace(views, camera_to_world=self.corrected(views.camera_to_world))
+            for name, views in scene.splits.items()
+        }
+        return replace(scene, splits=splits)
+
     @property
     def shared_parts(self) -> list[nn.Module]:
         return list(self.sampler.parts.values())
@@ -302,7 +311,8 @@ class RadianceModule(ViewScoring):
         self._losses.append(loss.detach())
         self._seen = rendering, terms
         self.batches += 1
-        self.error_map.observe(batch, rendering.colour)
+        shown = getattr(rendering.samples, "shown", None)
+        self.error_map.observe(batch, rendering.colour, shown)
         self.between_updates = False
         self._count(rendering, batch, loss)
         log_terms(self, terms, state)

@@ -244,5 +244,7 @@ class ViewScoring(LightningModule):
         if self._trainer is None or self._trainer.world_size == 1:
             return
         for part in self.shared_parts:
-            for buffer in part.buffers():
-                distributed.broadcast(buffer, src=0)
+            own = getattr(part, "own", ())
+            for name, buffer in part.named_buffers():
+                if name not in own:
+                    distributed.broadcast(buffer, src=0)

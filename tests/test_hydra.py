@@ -24,6 +24,7 @@ from xplanes.errors import ConfigError, SceneError
 from xplanes.evaluation import report
 from xplanes.evaluation.render import FRAMES
 from xplanes.evaluation.report import estimated
+from xplanes.experiment import Experiment
 from xplanes.launch import prepare
 from xplanes.run import prepare as prepare_run
 from xplanes.run import run
@@ -298,7 +299,8 @@ def test_arguments_of_lightnings_trainer_and_its_callbacks_work(extra, scenes, t
 
 def test_the_estimate_counts_every_image_as_the_field_is_when_it_is_drawn(scenes, tmp_path):
     changes = ("media=true", "trainer.max_steps=170", "callbacks.evaluation.at=[0,0.5]")
-    experiment = prepare_run(small_config(scenes, *changes), tmp_path).experiment
+    experiment = Experiment.read(small_config(scenes, *changes))
+    assert prepare_run(experiment, tmp_path).experiment is experiment
     data = SceneDataModule(experiment.data, seed=0)
     data.setup("fit")
     module = RadianceModule(experiment.method)

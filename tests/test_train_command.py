@@ -135,12 +135,6 @@ def test_auto_finds_runs_whatever_was_said_to_hydra(tmp_path, monkeypatch):
     own = ["seed=1", "hydra.searchpath=[file://groups]", "hydra.output_subdir=null"]
     assert prepare([*own, "resume=auto"])[-1].startswith("resume=outputs")
     assert prepare([own[0], own[2], "resume=auto"])[-1] == "resume=null"
-    # Hydra's own option for a folder of settings is recorded as the override that it stands for.
-    for option in (["--config-dir", "my groups"], ["--config-dir=my groups"], ["-cd", "my groups"]):
-        said = f"hydra.searchpath=['file://{tmp_path}/my groups']"
-        (run / "overrides.txt").write_text(f"{said}\nseed=1\n")
-        assert prepare([*option, "seed=1"]) == ["seed=1", said]
-        assert prepare([*option, "seed=1", "resume=auto"])[-1].startswith("resume=outputs")
 
 
 def test_a_resumed_run_may_change_options_that_it_added(tmp_path):
@@ -285,6 +279,9 @@ def test_home_is_expanded(monkeypatch, tmp_path):
     assert with_names("data.scene=~/a,~/b", several=True) == f"data.scene={tmp_path}/a,{tmp_path}/b"
     quoted_already = '''data.scene='a, b',"c, d"'''
     assert with_names(f"{quoted_already},e f", several=True) == f"{quoted_already},'e f'"
+    odd = [quoted(name) for name in ("o'b, c", "it's")]
+    assert with_names(f"run={','.join(odd)}", several=True) == f"run={','.join(odd)}"
+    assert with_names("run=a,it's,c", several=True) == f"run=a,{odd[1]},c"
     data = SceneDataModule.compose("data=blender", "data.root='~/a'", "data.scene=b")
     assert data.settings.folder == tmp_path / "a" / "b"
     plain = compose_plain("train", ["data=colmap"])["data"]

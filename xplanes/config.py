@@ -22,8 +22,8 @@ NAMES = (
 )
 """Settings whose values are names or paths, even if they look like numbers or lists."""
 
-UNQUOTED_COMMA = re.compile(r""",(?=(?:[^'"]|'[^']*'|"[^"]*")*$)""")
-"""A comma between values."""
+VALUE = re.compile(r"""('(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*"|[^,]*),""")
+"""A value before a comma, which may be in quotes."""
 
 ELSEWHERE = {
     "gpus": "trainer=ddp trainer.devices={}",
@@ -182,7 +182,7 @@ def with_names(override: str, *, several: bool = False) -> str:
         return override
     if "," in value and not several and key.lstrip("+~") == "data.scene":
         return override  # Hydra's own error says that a list of scenes needs --multirun.
-    parts = UNQUOTED_COMMA.split(value) if several else [value]
+    parts = VALUE.findall(f"{value},") if several else [value]
     parts = [part if _is_quoted(part) else quoted(at_home(part)) for part in parts]
     return f"{key}={','.join(parts)}"
 

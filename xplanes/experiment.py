@@ -85,12 +85,13 @@ class Experiment:
         return experiment
 
     def require_folder(self) -> None:
-        """Check that the folder of the scene exists, without reading it.
+        """Check that the folder of the scene exists, unless its reader may fetch it.
 
         Raises:
             SceneError: If it does not; the message says where to get the scene.
         """
-        if self.data.files and not self.data.folder.exists():
+        fetches = type(self.data).prepare is not SceneSettings.prepare
+        if self.data.files and not fetches and not self.data.folder.exists():
             self.data.load(("train",))
 
     @property

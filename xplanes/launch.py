@@ -215,7 +215,6 @@ def prepare(arguments: list[str]) -> list[str]:
         StorageError: If the folder of the run cannot be written.
     """
     require_readable(arguments)
-    arguments = _with_searchpath(arguments)
     mode = dict(map(key_and_value, arguments)).get("hydra.mode")
     several = mode == "MULTIRUN" or not {"-m", "--multirun"}.isdisjoint(arguments)
     _require_present_names(arguments, several=several)
@@ -250,22 +249,6 @@ def prepare(arguments: list[str]) -> list[str]:
             "leave hydra.run.dir out"
         )
     return _resumed(Path(resume), arguments)
-
-
-def _with_searchpath(arguments: list[str]) -> list[str]:
-    """Arguments with Hydra's option ``--config-dir`` as an override, which a run records."""
-    keys = {key_and_value(text)[0] for text in arguments}
-    found, folder = [], None
-    words = iter(arguments)
-    for word in words:
-        option, equals, value = word.partition("=")
-        if option in ("--config-dir", "-cd"):
-            folder = value if equals else next(words, "")
-        else:
-            found.append(word)
-    if not folder or SEARCHPATH in keys:
-        return arguments
-    return [*found, f"{SEARCHPATH}=[{quoted(f'file://{Path(folder).absolute()}')}]"]
 
 
 def _resumed(run: Path, arguments: list[str]) -> list[str]:

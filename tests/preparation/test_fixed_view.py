@@ -25,7 +25,8 @@ from xplanes.preparation.fixed_view import canonical_pose, fixed_view, pick_fram
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.sampler import Site
 from xplanes.scenes.frame import CubeHints, Frame, scene_frame
-from xplanes.training.module import TrainingError
+from xplanes.training import fit as training
+from xplanes.training.module import RadianceModule, TrainingError
 
 SMALL_FIELD = (
     "model.resolution=24",
@@ -79,7 +80,7 @@ def test_the_field_that_renders_has_its_models_default_settings(tmp_path):
 
 def test_all_timesteps_are_rendered_and_steps_alone_may_limit_training(tmp_path, monkeypatch):
     asked = {}
-    monkeypatch.setattr(module, "fit_quietly", lambda *_, **options: asked.update(options))
+    monkeypatch.setattr(training, "fit_quietly", lambda *_, **options: asked.update(options))
     open_ones = ("preparation.frames=null", "preparation.fixed_view_seconds=null")
     made, said = video_of(settings(tmp_path, *open_ones), ball_scene(7), tmp_path / "cache", size=4)
     assert (asked["max_steps"], asked["max_seconds"]) == (60, None)
@@ -354,7 +355,7 @@ def test_an_interrupted_field_is_resumed(tmp_path, small_fields, monkeypatch):
     assert list(cache.glob("fixed_view-*/checkpoints/last.ckpt"))
     monkeypatch.setattr(module, "_render", original)
     again = lambda *_: pytest.fail("a step that was done is done again")  # noqa: E731
-    monkeypatch.setattr(module.RadianceModule, "training_step", again)
+    monkeypatch.setattr(RadianceModule, "training_step", again)
     video_of(method, scene, cache)
     assert not list(cache.glob("fixed_view-*/"))
 
@@ -393,9 +394,9 @@ def test_masks_beside_opaque_images_cut_the_thing_out(tmp_path, monkeypatch):
     scene = replace(around(bare), lrm_views=bare.splits["train"])
     assert scene.is_surrounded
     trained = []
-    fit = module.fit_quietly
+    fit = training.fit_quietly
     monkeypatch.setattr(
-        module, "fit_quietly", lambda *given, **how: (trained.append(given), fit(*given, **how))
+        training, "fit_quietly", lambda *given, **how: (trained.append(given), fit(*given, **how))
     )
     _, said = video_of(settings(tmp_path, "preparation.fixed_view_steps=3"), scene, tmp_path)
     ((field, shown, *_),) = trained

@@ -190,14 +190,23 @@ def test_rays_that_say_nothing_move_nothing():
     views = views_of(surrounding(4, 4.0))
     cameras = CameraCorrections(CameraGroups.of(views, FRAME))
     rays = batches_of(views).draw(0)
-    blank = torch.zeros(len(rays["times"]))
-    wrong = torch.full_like(rays["target"], torch.nan)
+    target, one = rays["target"], torch.ones(len(rays["times"]))
     # Pixels of a fisheye lens beside the last one with a ray.
     same = rays | {"across": torch.zeros_like(rays["across"])}
-    for drawn, colour in ((rays, wrong), (rays, rays["target"]), (same, rays["target"] / 2)):
-        cameras.observe(drawn, Rendering(colour, blank, blank, blank, None))  # pyright: ignore
+    lost = torch.full_like(one, torch.nan)
+    cases = (
+        (rays, torch.full_like(target, torch.nan), one),
+        (rays, target, one),
+        (same, target / 2, one),
+        (rays, target / 2, lost),
+    )
+    for drawn, colour, opacity in cases:
+        cameras.observe(drawn, Rendering(colour, opacity, one, one, None))  # pyright: ignore
         cameras.solve()
         assert torch.equal(cameras.motion, torch.zeros(4, 6))
+    cameras.observe(rays, Rendering(target / 2, one, one, one, None))  # pyright: ignore
+    cameras.solve()
+    assert (cameras.motion != 0).any(dim=1).all(), "what said nothing has done no harm"
 
 
 def test_rays_without_slots_for_their_samples_do_not_count():

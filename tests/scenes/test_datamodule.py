@@ -115,6 +115,7 @@ def test_how_many_views_are_scored_does_not_change_what_is_trained_on():
         data.setup("fit")
         assert tuple(len(data.scene.splits[name]) for name in ("train", "val")) == counts
         held_out[most] = set(data.scene.splits["val"].files)
+        assert data.held_out == 5
     assert held_out[2] < held_out[None]
 
 

@@ -180,6 +180,7 @@ class CameraCorrections(nn.Module):
         shown = getattr(rendering.samples, "shown", None)
         if shown is not None:  # Other rays had no slots for their samples.
             usable &= shown[:, None]
+        opacity = torch.where(usable[:, 0], opacity, 0)
         difference = torch.where(usable, difference, 0)
         inverse = torch.where(usable, inverse[:, None], 0)[:, None]
         to_pixels = torch.where(usable[:, None], to_pixels, 0)
@@ -233,16 +234,23 @@ class CameraCorrections(nn.Module):
             poses: Given poses. [V, 4, 4]
             frame: The field's frame.
         """
-        given, motion = self.given.to(poses), self.motion.to(poses.device)
-        if not len(given):
+        count = len(self.given)
+        if not count:
             return poses
-        known = (given[None] == poses[:, None]).flatten(2).all(dim=-1)
-        motion = known.to(motion) @ motion  # No motion where no camera has this pose.
+        index = {pose: number for number, pose in enumerate(_keys(self.given.to(poses)))}
+        camera = torch.tensor([index.get(pose, count) for pose in _keys(poses)])
+        # Other cameras have no motion.
+        motion = torch.cat([self.motion, self.motion.new_zeros(1, 6)]).to(poses.device)[camera]
         turn = frame.rotation.T @ rotations(motion[:, :3]) @ frame.rotation
         found = poses.clone()
         found[:, :3, :3] = turn.to(found) @ poses[:, :3, :3]
         found[:, :3, 3] += (motion[:, 3:] @ frame.rotation / frame.scale).to(found)
-        return torch.where(known.any(dim=1)[:, None, None], found, poses)
+        return torch.where((camera < count)[:, None, None].to(poses.device), found, poses)
+
+
+def _keys(poses: Tensor) -> list[bytes]:
+    """Bytes of each pose; those of equal poses are equal. [V, 4, 4]"""
+    return [pose.tobytes() for pose in (poses + 0.0).cpu().numpy()]  # -0 becomes 0.
 
 
 def rotations(vectors: Tensor) -> Tensor:

@@ -74,6 +74,8 @@ class SceneDataModule(LightningDataModule):
         self.settings, self.seed = settings, seed
         self.first = 0
         """Number of batches already drawn."""
+        self.holds_out = True
+        """Whether training views may be held out for scores."""
         self.held_out = 0
         """Number of training views held out for validation, if the scene has no split for it."""
         self._scene: Scene | None = None
@@ -173,7 +175,7 @@ class SceneDataModule(LightningDataModule):
         if stage in ("fit", "validate"):
             if (split := self.validation_split) is None:
                 # Views that a test will score must not be trained on, either.
-                if scores or "test" not in self.scene.splits:
+                if self.holds_out and (scores or "test" not in self.scene.splits):
                     self._hold_out()
             elif scores:
                 self.read_split(split)
@@ -217,7 +219,7 @@ class SceneDataModule(LightningDataModule):
         chosen = torch.zeros(len(train), dtype=torch.bool)
         chosen[order[held_out_places(times.tolist(), HELD_OUT)]] = True
         train, val = (train.subset(part.nonzero()[:, 0]) for part in (~chosen, chosen))
-        shared = {*val.files}
+        shared, self.held_out = {*val.files}, len(val)
         # How many are scored must not change what is trained on.
         if (most := self.settings.eval_views) is not None:
             val = val.subset(spread(most, len(val)))
@@ -228,7 +230,6 @@ class SceneDataModule(LightningDataModule):
             lrm_views=_without(self.scene.lrm_views, shared),
         )
         self._batches = {}  # Earlier batches included the held-out views.
-        self.held_out = len(val)
 
     def batches(self, rank: int) -> Batches:
         """The batches of a process for the module in training, drawn on its device if possible."""

@@ -118,7 +118,7 @@ class ErrorMap:
             self._sums = self._sums.to(error.device)
         fresh = self._sums[1]
         counted = torch.ones_like(error) if shown is None else shown.to(error)
-        fresh[0].index_add_(0, tile, torch.where(counted > 0, error, 0))
+        fresh[0].index_add_(0, tile, error * counted)
         fresh[1].index_add_(0, tile, counted)
         self.batches += 1
         if self.batches % REFRESH == 0:

@@ -188,6 +188,7 @@ def fit_quietly(
         limit_val_batches=0,
     )
     data = SceneDataModule.of(scene, seed=module.method.seed)
+    data.holds_out = False
     warm_up_loops(module, data, device)
     trainer.train(module, data, find_resumable(folder / "checkpoints"))
 

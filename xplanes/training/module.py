@@ -289,6 +289,12 @@ class RadianceModule(ViewScoring):
         self._schedules = [c for c in callbacks if isinstance(getattr(c, "progress", None), float)]
         self.method.require_devices(trainer.world_size)
 
+    def on_train_start(self) -> None:
+        if self.global_rank:  # What a checkpoint holds counts once, in the first process.
+            for part in self.shared_parts:
+                for name in getattr(part, "own", ()):
+                    getattr(part, name).zero_()
+
     @property
     def _optimizer(self) -> torch.optim.Optimizer:
         optimizer = self.optimizers(use_pl_optimizer=False)

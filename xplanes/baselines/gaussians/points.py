@@ -97,6 +97,7 @@ class FieldInitialiser(Initialiser):
             views.identity,
             views.camera_to_world,
             views.times,
+            views.ignored,
             intrinsics_key(views.intrinsics),
             frame_content(place.frame),
             field.plain(),

@@ -31,6 +31,11 @@ class Rendering:
     density: Tensor
     samples: Samples
 
+    @property
+    def shown(self) -> Tensor | None:
+        """Rays whose samples had slots and which count; None for all. bool [R]"""
+        return getattr(self.samples, "shown", None)
+
 
 class Renderer(ABC):
     """Renders images of a field from cameras."""

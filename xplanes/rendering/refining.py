@@ -177,9 +177,8 @@ class CameraCorrections(nn.Module):
         # A lens may have no ray for the next pixel, and a field may return NaN.
         usable = (difference.isfinite().all(dim=-1) & inverse.isfinite())[:, None]
         usable &= area > LEAST_AREA * across * along
-        shown = getattr(rendering.samples, "shown", None)
-        if shown is not None:  # Other rays had no slots for their samples.
-            usable &= shown[:, None]
+        if rendering.shown is not None:
+            usable &= rendering.shown[:, None]
         opacity = torch.where(usable[:, 0], opacity, 0)
         difference = torch.where(usable, difference, 0)
         inverse = torch.where(usable, inverse[:, None], 0)[:, None]

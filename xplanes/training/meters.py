@@ -148,7 +148,7 @@ def _of_all(values: dict[str, float], trainer: Trainer) -> dict[str, float]:
 def batch_values(rendering: Rendering, rays: Batch, loss: Tensor) -> dict[str, Tensor | float]:
     """Numbers of a batch for `Tally.add_batch`."""
     count, samples = len(rays["times"]), rendering.samples
-    shown: Tensor | None = getattr(samples, "shown", None)
+    shown = rendering.shown
     values = {name: getattr(samples, name) for name in ("candidates", "empty", "occluded")}
     values |= {"samples": samples.count, "batches": 1, "all_rays": count, "loss": loss}
     values["rays"] = count if shown is None else shown.sum()
@@ -169,7 +169,7 @@ def mean_opacities(rendering: Rendering, rays: Batch) -> dict[str, Tensor]:
     which = {"foreground": far & (rays["alpha"] > 0.5), "background": rays["alpha"] == 0}
     if opacity.device.type == "cpu":
         return {name: opacity[chosen].mean() for name, chosen in which.items()}
-    shown: Tensor | None = getattr(rendering.samples, "shown", None)
+    shown = rendering.shown
     both = which if shown is None else {name: some & shown for name, some in which.items()}
     return {name: masked_mean(opacity, some) for name, some in both.items()}
 

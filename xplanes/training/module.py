@@ -317,8 +317,7 @@ class RadianceModule(ViewScoring):
         self._losses.append(loss.detach())
         self._seen = rendering, terms
         self.batches += 1
-        shown = getattr(rendering.samples, "shown", None)
-        self.error_map.observe(batch, rendering.colour, shown)
+        self.error_map.observe(batch, rendering.colour, rendering.shown)
         self.between_updates = False
         self._count(rendering, batch, loss)
         log_terms(self, terms, state)

@@ -1,5 +1,6 @@
 """`python train.py` as a user types it."""
 
+import errno
 import itertools
 import os
 import re
@@ -28,7 +29,7 @@ from xplanes.config import CONF, compose_plain, quoted, unquoted, with_names
 from xplanes.errors import ConfigError
 from xplanes.files import StorageError
 from xplanes.launch import SettingsCheck, prepare
-from xplanes.locks import alone_in, in_turn
+from xplanes.locks import alone_in, if_free, in_turn
 from xplanes.process import resume_command
 from xplanes.scenes.colmap import ColmapSettings
 
@@ -396,11 +397,23 @@ def test_a_run_is_alone_in_its_folder_and_ctrl_c_saves_it(root, tmp_path):
         assert (run / ".lock").is_file()
 
 
-def test_turns_are_free_when_nobody_holds_them(tmp_path):
-    with in_turn(tmp_path / "a.lock") as waited:
-        assert not waited
-    with in_turn(None) as waited:
-        assert not waited
+def test_a_turn_holds_its_lock(tmp_path):
+    path = tmp_path / "a.lock"
+    with in_turn(path), if_free(path) as free:
+        assert not free
+    with in_turn(None), if_free(path) as free:
+        assert free
+
+
+def test_files_that_cannot_be_locked_stop_nothing(tmp_path, caplog, monkeypatch):
+    def refuse(*_args, **_options):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("filelock.FileLock.acquire", refuse)
+    path = tmp_path / "a.lock"
+    with in_turn(path), if_free(path) as free:
+        assert not free
+    assert "a.lock cannot be locked" in caplog.text
 
 
 @pytest.mark.slow

@@ -167,10 +167,14 @@ def clear_unfinished(folder: Path, older_than: float = 0.0) -> None:
         folder: Searched recursively.
         older_than: Least age in seconds of removed files; newer ones may still be in use.
     """
-    for path in folder.rglob(f".*{MARK}*"):
-        with suppress(OSError):  # Another process has removed it, or the folder is read-only.
-            if path.is_file() and time.time() - path.stat().st_mtime >= older_than:
-                path.unlink()
+    for place, _, names in os.walk(folder):  # Goes on if another process removes a folder.
+        for name in names:
+            path = Path(place, name)
+            if not (name.startswith(".") and MARK in name):
+                continue
+            with suppress(OSError):  # Another process has removed it, or the folder is read-only.
+                if time.time() - path.stat().st_mtime >= older_than:
+                    path.unlink()
 
 
 def write_text(path: Path, text: str) -> None:

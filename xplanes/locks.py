@@ -15,28 +15,33 @@ logger = logging.getLogger(__name__)
 RUN_LOCK = ".lock"
 """File in a run directory that the running process locks."""
 
+_UNLOCKABLE = OSError, NotImplementedError
+"""Errors of file systems without locks, such as NFS without a lock daemon."""
+
 
 @contextmanager
-def in_turn(path: Path | None) -> Iterator[bool]:
+def in_turn(path: Path | None) -> Iterator[None]:
     """Wait for a lock, and hold it within the block.
 
     Args:
         path: The lock's file; None: no lock.
-
-    Returns:
-        Whether this process had to wait.
     """
     if path is None:
-        yield False
+        yield
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    with if_free(path) as free:
-        if free:
-            yield False
-            return
-    logger.warning("%s: another process is making it; waiting", path.with_suffix(""))
-    with FileLock(path):
-        yield True
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        logger.warning("%s: another process is making it; waiting", path.with_suffix(""))
+        lock.acquire()
+    except _UNLOCKABLE as problem:
+        logger.warning("%s cannot be locked (%s): several processes may make it", path, problem)
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 @contextmanager
@@ -44,10 +49,10 @@ def if_free(path: Path) -> Iterator[bool]:
     """Hold a lock within the block, unless another process holds it.
 
     Returns:
-        Whether this process holds it.
+        Whether this process holds it; False also where files cannot be locked.
     """
     lock = FileLock(path)
-    with suppress(Timeout):
+    with suppress(*_UNLOCKABLE):  # A timeout is an OSError, too.
         lock.acquire(timeout=0)
     try:
         yield lock.is_locked
@@ -73,7 +78,7 @@ def alone_in(run: Path) -> Iterator[None]:
         raise ConfigError(
             f"{run} is in use by {process}: wait for it to end, stop it, or choose another folder"
         ) from None
-    except (OSError, NotImplementedError) as problem:
+    except _UNLOCKABLE as problem:
         logger.warning("%s cannot be locked (%s): start no second process in it", run, problem)
     try:
         yield

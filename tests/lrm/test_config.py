@@ -50,6 +50,13 @@ def test_what_the_file_does_not_say_can_be_given():
     assert config.encoder.mean == config.encoder.std == (0.5, 0.5, 0.5)
 
 
+def test_keys_beside_or_in_the_section_of_the_model_count_alike():
+    more = {"source_focal": 1.25, "density_scale": 3.0, "image_size": 140}
+    for top, inner in ((more, {}), ({}, more)):
+        config = parse_config({"model": {**CONFIGS["openlrm-1.1"], **inner}, **top})
+        assert (config.source_focal, config.density_scale, config.image_size) == (1.25, 3.0, 140)
+
+
 UNUSABLE = [
     ("openlrm-1.1", {"transformer_dim": None}, "transformer_dim=None"),
     ("openlrm-1.1", {"transformer_heads": 3}, "transformer_heads=3"),

@@ -130,12 +130,13 @@ def test_offline_says_everything_at_once(tmp_path):
         assert part in str(caught.value)
 
 
-def test_silent_server_is_given_up_in_a_second(monkeypatch):
+def test_silent_server_is_given_up_in_time(monkeypatch):
     def hang(*_):
         time.sleep(2)
         raise OSError
 
     monkeypatch.setattr("socket.create_connection", hang)
+    monkeypatch.setattr("xplanes.lrm.weights.PATIENCE_SECONDS", 0.1)
     start = time.monotonic()
     assert not answers("https://hub.example")
     assert time.monotonic() - start < 1
@@ -146,6 +147,15 @@ def test_proxy_is_asked_instead(hub, monkeypatch):
     monkeypatch.setenv("http_proxy", address)
     monkeypatch.setenv("no_proxy", "")
     assert answers("http://192.0.2.1")
+
+
+def test_one_proxy_for_all_schemes_is_asked(hub, monkeypatch):
+    address, _ = hub
+    for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("all_proxy", address)
+    monkeypatch.setenv("no_proxy", "")
+    assert answers("https://192.0.2.1")
 
 
 def test_forbidden_download(monkeypatch, tmp_path):

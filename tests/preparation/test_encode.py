@@ -109,6 +109,31 @@ def test_bfloat16_is_kept_apart_and_close(tmp_path):
     assert 0 < gap < 0.03
 
 
+class Own(torch.nn.Module):
+    """An LRM that somebody else wrote, with dropout and no thought of gradients."""
+
+    def __init__(self, side=3):
+        super().__init__()
+        self.layer = torch.nn.Sequential(torch.nn.Linear(3, 6), torch.nn.Dropout())
+        self.side = side
+
+    def prepare(self, rgba):
+        return rgba[:, :3]
+
+    def encode(self, images):
+        features = self.layer(images.mean((2, 3)))
+        return features.view(-1, 3, 2, 1, 1).expand(-1, -1, -1, 3, self.side)
+
+
+def test_an_lrm_of_ones_own_is_evaluated_not_trained():
+    model, frames, cache = Own(), frames_of(3), StageCache(None)
+    first, again = (run(model, frames, cache).triplanes for _ in range(2))
+    assert torch.equal(first, again)
+    assert not first.requires_grad
+    with pytest.raises(LRMError, match=r"Own\.encode returns \[2, 3, 2, 3, 5\]: must be \[2, 3,"):
+        run(Own(side=5), frames, cache)
+
+
 def test_a_triplane_that_is_not_finite_is_refused_and_not_kept(tmp_path, monkeypatch):
     model, frames, cache = model_of(), frames_of(2), StageCache(tmp_path)
     original = model.encode

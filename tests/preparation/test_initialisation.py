@@ -18,9 +18,11 @@ from xplanes.errors import ConfigError
 from xplanes.evaluation import render
 from xplanes.fields import Decoder
 from xplanes.fields.xplanes import PLANE_SETS
-from xplanes.models.initialisation import STAGES, Initialisation, Method
+from xplanes.models.initialisation import STAGES, Initialisation, Method, Place
 from xplanes.preparation import TriplaneSequence, save_triplanes
 from xplanes.preparation import stages as stages_module
+from xplanes.preparation.cache import StageCache
+from xplanes.preparation.sources import from_sequence
 from xplanes.scenes.frame import Frame, cube_frame
 from xplanes.training.module import RadianceModule
 
@@ -140,6 +142,10 @@ def test_a_second_initialisation_comes_from_the_cache(finished, monkeypatch):
     assert "cached" in again.description
     with pytest.raises(AssertionError, match="computed again"):
         initialised(folder, SEQUENCE, "decomposition.tolerance=0.001")
+    # A user's own plane set is corrected under its old name.
+    monkeypatch.setitem(PLANE_SETS, "six", ((0, 2), (0, 1), (1, 2)))
+    with pytest.raises(AssertionError, match="computed again"):
+        initialised(folder, SEQUENCE)
 
 
 def test_the_cache_can_be_switched_off(tmp_path, monkeypatch):
@@ -198,6 +204,13 @@ def test_one_triplane_is_the_space_planes(tmp_path, caplog):
         assert (found.report, found.pictures, module.model.sparse) == ({}, {}, None)
         for index, name in enumerate(("xy", "xz", "yz")):
             assert torch.equal(found.values.planes[name], sequence.triplanes[0, index]), name
+
+
+def test_a_sequence_of_ones_own_source_is_checked(tmp_path):
+    place = Place(scene=ball_scene(), frame=FRAME, device=torch.device("cpu"))
+    wrong = TriplaneSequence(torch.full((1, 3, 4, 8, 8), torch.nan))
+    with pytest.raises(ConfigError, match="mine: triplane 0 of 1 holds NaN"):
+        from_sequence(wrong, settings(tmp_path), place, StageCache(None), source="mine", seconds={})
 
 
 def test_seeds_change_the_noise_only(finished):

@@ -68,19 +68,20 @@ class XPlanes(RadianceField):
         self.plane_set = plane_set
         self.rows = PLANE_SETS[plane_set]
         names = TIME_PLANES[plane_set]
-        if set(planes) - set(FINE_PLANES) != {*SPACE_PLANES, *names}:
+        fine = bool(set(FINE_PLANES) & set(planes))
+        if set(planes) != {*SPACE_PLANES, *names, *(FINE_PLANES if fine else ())}:
             raise ValueError(
                 f"planes are {', '.join(sorted(planes))}: plane_set={plane_set!r} needs "
                 f"{', '.join((*SPACE_PLANES, *names))}, and takes {', '.join(FINE_PLANES)}"
             )
         self.space = nn.Parameter(_stack(planes, SPACE_PLANES))
         self.time = nn.Parameter(_stack(planes, names)) if names else None
-        fine = FINE_PLANES[0] in planes
         self.fine = nn.Parameter(_stack(planes, FINE_PLANES)) if fine else None
         self.is_fine = True
         """Whether fine planes are read; False saves time while they are zero."""
-        if self.space.shape[1] != self.space.shape[2]:
-            raise ValueError(f"space planes are {list(planes['xy'].shape)}: must be [C, H, H]")
+        for stack, name in ((self.space, "xy"), (self.fine, "xy_fine")):
+            if stack is not None and stack.shape[1] != stack.shape[2]:
+                raise ValueError(f"plane {name} is {list(planes[name].shape)}: must be [C, H, H]")
         if self.time is not None and self.time.shape[3] != self.space.shape[3]:
             raise ValueError(
                 f"time planes have {self.time.shape[3]} channels, space planes "

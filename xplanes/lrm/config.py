@@ -239,7 +239,9 @@ SOURCE_SIZES = {512: 224, 768: 336, 1024: 448}
 def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig:
     nested = isinstance(config.get("model"), Mapping)
     model = Reader(config).inner("model") if nested else Reader(config)
-    reduced = _encoder_sizes(config) or _encoder_sizes(model.values)
+    # Keys that published files lack may be written beside the section of the model, or in it.
+    given = Reader({**config, **model.values})
+    reduced = _encoder_sizes(given.values)
     width, low = model.integer("transformer_dim"), model.integer("triplane_low_res")
     if model.integer("triplane_high_res", 2 * low) != 2 * low:
         raise LRMError(
@@ -252,7 +254,7 @@ def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig
         encoder = _dinov2(name, reduced)
         fallback = encoder.grid * encoder.patch if reduced else SOURCE_SIZES.get(width, 224)
     else:
-        encoder = _dino(name, reduced, {**config, **model.values})
+        encoder = _dino(name, reduced, given.values)
         fallback = 224
     model.require("encoder_feat_dim", encoder.width)
     infer = config.get("infer")
@@ -263,7 +265,7 @@ def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig
         raise LRMError(f"transformer_dim={width} cannot be split into transformer_heads={heads}")
     return LRMConfig(
         architecture=architecture,
-        image_size=Reader(config).integer("image_size", fallback),
+        image_size=given.integer("image_size", fallback),
         encoder=encoder,
         width=width,
         layers=model.integer("transformer_layers"),
@@ -272,9 +274,9 @@ def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig
         channels=model.integer("triplane_dim"),
         low_resolution=low,
         camera_width=model.integer("camera_embed_dim"),
-        source_distance=model.positive("source_distance", OPENLRM_VIEW.distance),
-        source_focal=model.positive("source_focal", OPENLRM_VIEW.focal),
-        density_scale=model.positive("density_scale", 1.0),
+        source_distance=given.positive("source_distance", OPENLRM_VIEW.distance),
+        source_focal=given.positive("source_focal", OPENLRM_VIEW.focal),
+        density_scale=given.positive("density_scale", 1.0),
     )
 
 

@@ -21,7 +21,8 @@ from xplanes.lrm.model import LRM
 from xplanes.optional import require
 from xplanes.settings import Count, Location, Settings
 
-PATIENCE_SECONDS = 0.8
+PATIENCE_SECONDS = 3.0
+"""Time for name lookup and connection; a refusal ends the wait early."""
 
 
 def answers(url: str) -> bool:
@@ -33,10 +34,11 @@ def answers(url: str) -> bool:
         url: Address of the server, http or https.
     """
     parts = urlsplit(url)
-    proxy = getproxies().get(parts.scheme)
+    proxies = getproxies()
+    proxy = proxies.get(parts.scheme) or proxies.get("all")
     if proxy and not proxy_bypass(parts.hostname or ""):
         parts = urlsplit(proxy if "//" in proxy else f"//{proxy}")
-    port = parts.port or (443 if parts.scheme == "https" else 80)
+    port = parts.port or {"https": 443, "http": 80}.get(parts.scheme, 1080)
     accepted = threading.Event()
 
     def connect() -> None:

@@ -86,8 +86,9 @@ class StageCache:
         lock = path.with_suffix(".lock") if path and alone and self.writable else None
         if (found := _find(path, key)) is not None:
             return found
-        with in_turn(lock) as waited:
-            if waited and (found := _find(path, key)) is not None:
+        with in_turn(lock):
+            # Another process may have finished it before the lock was free.
+            if lock is not None and (found := _find(path, key)) is not None:
                 return found
             began = time.perf_counter() - warm_up.seconds
             content = make()

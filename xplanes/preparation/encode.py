@@ -31,6 +31,7 @@ class Encoded:
     seconds: float
 
 
+@torch.no_grad()
 def encode(
     model: LRM,
     key: str,
@@ -58,7 +59,7 @@ def encode(
         bf16: Use bfloat16 products.
 
     Raises:
-        LRMError: If a triplane is not finite.
+        LRMError: If a triplane is not finite, or of another shape.
     """
     places: dict[str, list[int]] = {}
     for number, frame in enumerate(frames):
@@ -79,7 +80,7 @@ def encode(
             seconds += stage.seconds
     cached = len(found)
     if missing:
-        model = model.to(device)
+        model = model.to(device).eval()
     chunks = [missing[start : start + batch] for start in range(0, len(missing), batch)]
     # Only on a terminal: in a log file a progress bar would fill many lines.
     for chunk in tqdm(chunks, "triplanes", unit="batch", leave=False, disable=None):
@@ -88,6 +89,11 @@ def encode(
         pictures = model.prepare(crop.apply(straight_alpha(frames[first])))
         with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
             planes = model.encode(pictures.to(device)).float().cpu()
+        shape = list(planes.shape)
+        if len(shape) != 5 or shape[:2] != [len(chunk), 3] or shape[3] != shape[4]:
+            raise LRMError(
+                f"{type(model).__name__}.encode returns {shape}: must be [{len(chunk)}, 3, C, H, H]"
+            )
         if not bool(planes.isfinite().all()):
             raise LRMError(
                 f"the LRM makes NaN or infinity of frame {int(first[0])} or a later one: its "

@@ -24,7 +24,7 @@ from xplanes.models.x_planes import XPlanesSettings
 from xplanes.preparation.cache import Stage, StageCache
 from xplanes.preparation.fixed_view import given_video
 from xplanes.preparation.reconstruct import ImageLRMSettings, LoadedLRM, loaded, reconstruct
-from xplanes.preparation.sequence import TriplaneSequence, load_triplanes
+from xplanes.preparation.sequence import TriplaneSequence, check_sequence, load_triplanes
 from xplanes.preparation.stages import (
     convert_stage,
     decompose_stage,
@@ -202,13 +202,17 @@ def from_sequence(
     """Convert a triplane sequence from any source to an initialisation.
 
     Args:
-        sequence: The sequence, checked.
+        sequence: The sequence.
         method: The run's settings.
         place: The scene and its frame; the frame is used if the sequence has none.
         cache: Cache of the stages.
         source: Name of the sequence in messages.
         seconds: Seconds of the preceding stages.
+
+    Raises:
+        ConfigError, SceneError: If the sequence is invalid (`check_sequence`).
     """
+    check_sequence(sequence, source)
     views = place.scene.splits["train"]
     model = _settings_for(method, sequence, views, source=source)
     if len(sequence.triplanes) == 1 and not views.is_static:

@@ -190,7 +190,7 @@ def convert_stage(
         space = space_planes(low_rank, static=config.static, resolution=model.resolution)
         content: dict[str, Any] = {"space": space.cpu(), "time": None, "unexplained": {}}
         if sparse is not None:
-            moved, rows = sparse.to(device), PLANE_SETS[model.plane_set]
+            moved = sparse.to(device)
             begun = begin(config.dynamic, moved)
             content["time"] = begun.cpu()
             content["unexplained"] = {
@@ -199,7 +199,8 @@ def convert_stage(
             }
         return content
 
-    of_time = [config.dynamic, config.noise, model.plane_set, model.time_resolution]
+    rows = PLANE_SETS[model.plane_set]  # A user's own may change under the same name.
+    of_time = [config.dynamic, config.noise, model.plane_set, rows, model.time_resolution]
     of_time += [model.texels_of_time, seed]
     inputs = [parts.key, config.static, model.resolution, of_time if moving else []]
     return cache.stage("planes", inputs, make)

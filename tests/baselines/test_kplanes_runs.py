@@ -76,12 +76,15 @@ def test_settings_that_do_not_go_together_are_refused(scenes):
         check_refused(scenes, words, "model=kplanes", override, *extra)
 
 
-def test_cameras_out_of_range_are_refused(scenes):
+def test_cameras_out_of_range_are_refused_or_named(scenes, caplog):
     settings = Method.read(baseline_config(scenes, "model=kplanes")).model
     views = ball_views(4, 0.6, distance=12.0)
     site = Site(settings.frame(views), views.times, 0, "32", views=views)
     with pytest.raises(ConfigError, match=r"model\.sampler\.far=6\.0: the cameras stand 12 to 12"):
         check_range(site, 2.0, 6.0)
+    near = ball_views(4, 0.6, distance=5.8)
+    check_range(replace(site, views=near), 2.0, 6.0)
+    assert "far=6: the scene is 5." in caplog.text
     # The sampler asks.
     with pytest.raises(ConfigError, match=r"model\.sampler\.far=6\.0: the cameras stand 12 to 12"):
         settings.sampler.build(settings.build(site).field, site)

@@ -119,6 +119,11 @@ def test_initial_surface_is_a_sphere():
     assert outward.mean().item() == pytest.approx(1, abs=0.2)
 
 
+def test_a_network_without_octaves_is_initialised_too():
+    network = SkipNetwork(3, 10, 32, 4, radius=0.5)
+    assert network(torch.rand(5, 3), torch.rand(5, 10)).isfinite().all()
+
+
 def test_slopes_are_the_distances_derivatives():
     field = surface().double()
     points, times = 0.8 * (2 * torch.rand(6, 3).double() - 1), torch.linspace(0, 1, 6).double()

@@ -159,7 +159,9 @@ def test_glb_files_are_matt_and_leave_the_world_to_a_node(tmp_path, what):
     (primitive,) = (each for mesh in tree["meshes"] for each in mesh["primitives"])
     surface = tree["materials"][primitive["material"]]["pbrMetallicRoughness"]
     assert (surface["metallicFactor"], surface["roughnessFactor"]) == (0, 1)
-    assert "COLOR_0" in primitive["attributes"]
+    colours = tree["accessors"][primitive["attributes"]["COLOR_0"]]
+    assert colours["componentType"] == (5126 if what == "mesh" else 5121)  # Floats, or bytes.
+    assert "_EXACT" not in primitive["attributes"]
     (node,) = (node for node in tree["nodes"] if "mesh" in node)
     turn = np.array(node["matrix"]).reshape(4, 4).T
     assert (turn[:3, :3] @ [0, 0, 1]).round(6).tolist() == [0, 1, 0]

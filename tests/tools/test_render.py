@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from xplanes.errors import ConfigError
 from xplanes.evaluation.render import training_path, write_video
@@ -84,6 +84,17 @@ def test_a_webp_is_the_default(trained):
         assert (picture.n_frames, picture.size) == (3, (20, 20))  # type: ignore[attr-defined]
         picture.load()
         assert picture.info["duration"] == 100
+
+
+def test_frames_of_a_webp_last_as_long_together_as_asked(tmp_path):
+    frames = [torch.full((4, 4, 3), 10 * number, dtype=torch.uint8) for number in range(24)]
+    path, durations = write_video(tmp_path / "a.webp", frames, fps=60), []
+    with Image.open(path) as picture:
+        for frame in ImageSequence.Iterator(picture):
+            frame.load()
+            durations.append(frame.info["duration"])
+    assert sum(durations) == 400
+    assert set(durations) == {16, 17}
 
 
 def test_a_folder_takes_a_png_per_frame_and_no_others(trained, tmp_path):

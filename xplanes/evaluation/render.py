@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -139,7 +140,10 @@ def write_video(path: Path, frames: Iterable[Tensor], *, fps: int, folder: bool 
                 writer.append_data(frame[:height, :width].numpy())
     else:
         first, *rest = [Image.fromarray(frame.numpy()) for frame in frames]
-        video = {"save_all": True, "append_images": rest, "duration": round(1000 / fps), "loop": 0}
+        # Whole milliseconds, which add up to the duration of all frames.
+        ends = [round(1000 * number / fps) for number in range(len(rest) + 2)]
+        durations = [end - start for start, end in pairwise(ends)]
+        video = {"save_all": True, "append_images": rest, "duration": durations, "loop": 0}
         with replacing(path) as temporary:
             first.save(temporary, format="WEBP", quality=85, method=2, **video)
     return path

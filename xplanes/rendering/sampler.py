@@ -389,6 +389,8 @@ def seen_range(views: Views, scene: Frame) -> tuple[float, float]:
 def check_range(site: Site, near: float, far: float) -> None:
     """Refuse near and far if the centre of the field's box does not lie between them.
 
+    Warns if a part of the scene does not.
+
     Raises:
         ConfigError: With the cameras' distances.
     """
@@ -402,4 +404,11 @@ def check_range(site: Site, near: float, far: float) -> None:
             f"model.sampler.near={near} with model.sampler.far={far}: the cameras stand "
             f"{nearest:.3g} to {farthest:.3g} world units from the centre of the field's box; set "
             "both to numbers around these"
+        )
+    least, most = seen_range(site.views, scene_frame(site.views))
+    if least < near or most > far:
+        logger.warning(
+            "model.sampler.near=%g with model.sampler.far=%g: the scene is %.3g to %.3g world "
+            "units from the cameras, and nothing is sampled outside the bounds; set them to these",
+            *(near, far, least, most),
         )

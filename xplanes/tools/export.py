@@ -263,12 +263,14 @@ def _write_shape(path: Path, shape: Shape) -> None:
     """Write a mesh or a point cloud as PLY or GLB."""
     _, trimesh = _mesh_tools()
     linear = path.suffix == ".glb"  # The GLB standard prescribes linear colours, PLY has sRGB.
-    pixels = (255 * (_linear(shape.colours) if linear else shape.colours)).round().byte().numpy()
-    world = shape.places.numpy()
+    colours = _linear(shape.colours) if linear else shape.colours
+    pixels, world = (255 * colours).round().byte().numpy(), shape.places.numpy()
     if shape.faces is None:
         found = trimesh.PointCloud(world, colors=pixels)
     else:
         found = trimesh.Trimesh(world, shape.faces, vertex_colors=pixels, process=False)
+        if linear:  # Bytes would have hardly any levels in the dark.
+            found.vertex_attributes[EXACT] = colours.float().numpy()
     with replacing(path) as temporary:
         temporary.write_bytes(_glb(found) if linear else found.export(file_type="ply"))
 
@@ -317,6 +319,10 @@ def _write_web(
     return facts
 
 
+EXACT = "_EXACT"
+"""Name under which trimesh writes linear colours in single precision."""
+
+
 def _glb(geometry: Any) -> bytes:
     """A GLB file with y up and a matt material.
 
@@ -333,6 +339,9 @@ def _glb(geometry: Any) -> bytes:
         for mesh in tree["meshes"]:
             for primitive in mesh["primitives"]:
                 primitive["material"] = 0
+                attributes = primitive["attributes"]
+                if EXACT in attributes:
+                    attributes["COLOR_0"] = attributes.pop(EXACT)
 
     return scene.export(file_type="glb", tree_postprocessor=matt)
 

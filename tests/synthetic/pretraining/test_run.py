@@ -177,17 +177,26 @@ def test_every_parameter_has_one_optimizer_and_rates_rise_stay_and_fall():
     assert rates == [0.25, 1, 1, 1, 0.5, 0]
 
 
-def test_non_finite_losses_end_training_with_a_message(monkeypatch):
+@pytest.mark.parametrize("kind", ["loss", "gradient"])
+def test_what_is_not_finite_changes_no_weight_and_ends_training_with_a_message(monkeypatch, kind):
     _, taught = module()
     optimizers = taught.configure_optimizers()
     taught.optimizers = lambda: optimizers
-    broken = (torch.tensor(float("nan")), {})
-    monkeypatch.setattr(taught, "losses", lambda batch: broken)
+    taught.manual_backward = lambda loss: loss.backward()
+    first = next(taught.model.parameters())
+    start = first.detach().clone()
+
+    def broken(_batch):
+        none = (first - first).sum()
+        return (none * torch.nan if kind == "loss" else none.sqrt()), {}
+
+    monkeypatch.setattr(taught, "losses", broken)
     for step in range(PATIENCE - 1):
         taught.training_step(None, step)  # type: ignore[arg-type]
     with pytest.raises(PretrainingError, match=r"schedule\.muon_lr"):
         taught.training_step(None, PATIENCE)  # type: ignore[arg-type]
     assert taught.steps == 0
+    assert torch.equal(first, start)
 
 
 def test_invalid_settings_end_the_command_with_a_message(capsys):

@@ -64,7 +64,7 @@ def _start_as_sphere(layers: list[nn.Linear], inputs: int, radius: float) -> Non
         nn.init.zeros_(layer.bias)
     # Encodings would distort the sphere.
     layers[0].weight[:, 3:] = 0
-    layers[1].weight[:, -(inputs - 3) :] = 0
+    layers[1].weight[:, layers[1].in_features - (inputs - 3) :] = 0
     last = layers[-1]
     nn.init.normal_(last.weight, math.sqrt(math.pi / last.in_features), 1e-4)
     nn.init.constant_(last.bias, -radius)

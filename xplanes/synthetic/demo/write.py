@@ -77,7 +77,7 @@ def ensure_demo_scene(
         root: Folder of the demo scenes; created if missing.
         name: Name of the scene.
         resolution: Height and width of the images in pixels.
-        seed: Seed of colours, motion phases and cameras.
+        seed: Seed of the variations of a scene: some of colours, shapes and cameras.
         train_views: Number of training views; one random camera per timestep, evenly spaced times.
         val_views: Number of validation views.
         test_views: Number of test views.
@@ -292,7 +292,7 @@ def _publish(fresh: Path, folder: Path, record: dict[str, Any]) -> None:
 class ProceduralSettings(SceneSettings, ABC):
     """A procedural scene, rendered on first use."""
 
-    seed: Steps  # Seed of colours, motion phases and cameras.
+    seed: Steps  # Seed of the variations of a scene: some of colours, shapes and cameras.
     train_views: Count  # Training views, each at its own timestep.
     test_views: Count  # Test views, at timesteps other than the training views'.
     val_views: Count  # Validation views.

@@ -103,15 +103,17 @@ class PretrainingModule(LightningModule):
         assert isinstance(optimizers, list)
         self._set_learning_rates()
         loss, parts = self.losses(batch)
-        if not math.isfinite(float(loss.detach())):
-            self._refuse(float(loss.detach()))
-            return
-        self.unusable = 0
         self.manual_backward(loss)
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.schedule.clip)
+        usable = math.isfinite(float(loss.detach()) + float(norm))
         for optimizer in optimizers:
-            optimizer.step()
+            if usable:
+                optimizer.step()
             optimizer.zero_grad()
+        if not usable:
+            self._refuse(float(loss.detach()), float(norm))
+            return
+        self.unusable = 0
         self.steps += 1
         keep = min(self.schedule.average, (1 + self.steps) / (10 + self.steps))
         get_ema_multi_avg_fn(keep)([*self.average.parameters()], [*self.model.parameters()], 0)
@@ -171,13 +173,13 @@ class PretrainingModule(LightningModule):
             for group in optimizer.param_groups:
                 group["lr"] = self.rate * peak
 
-    def _refuse(self, value: float) -> None:
+    def _refuse(self, loss: float, norm: float) -> None:
         self.unusable += 1
         if self.unusable >= PATIENCE:
             raise PretrainingError(
-                f"the loss was {value} for {PATIENCE} steps in a row, at step {self.steps}: lower "
-                f"schedule.muon_lr={self.schedule.muon_lr} and schedule.adam_lr="
-                f"{self.schedule.adam_lr}, then resume from an earlier checkpoint"
+                f"the loss was {loss} and its gradient's norm {norm} for {PATIENCE} steps in a "
+                f"row, at step {self.steps}: lower schedule.muon_lr={self.schedule.muon_lr} and "
+                f"schedule.adam_lr={self.schedule.adam_lr}, and begin again"
             )
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -1,5 +1,6 @@
 """Scores of a trained run, view by view."""
 
+import logging
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,8 @@ from xplanes.files import is_there, write_json
 from xplanes.optional import require
 from xplanes.tools.runs import TrainedRun
 from xplanes.training.scores import mean, score_view
+
+logger = logging.getLogger(__name__)
 
 DEFAULT_NETWORK = "vgg"
 WEIGHTS = {
@@ -49,6 +52,8 @@ def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
             metric = lpips(name, side, device, download=network is not None)
         except UnavailableError as reason:
             missing = {tag: str(reason)}
+            if network is not None:
+                logger.warning("--lpips %s: not computed: %s", network, reason)
     began = time.perf_counter()
     rows: list[dict[str, Any]] = []
     for index in tqdm(range(len(views)), "views", leave=False, delay=2, disable=None):

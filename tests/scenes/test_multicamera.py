@@ -177,6 +177,17 @@ def test_folders_of_images_keep_every_pixel(images):
         require_all(read(images))
 
 
+def test_cameras_in_map_coordinates_are_read_relative_to_a_point_near_them(images):
+    path = images / "poses_bounds.npy"
+    poses = np.load(path)
+    poses[:, [3, 8, 13]] += [500_000, 5_400_000, 300]
+    np.save(path, poses)
+    with told(r"read relative to \(500001, 5399999, 302\)"):
+        found = read(images, orient=False).splits["train"].camera_to_world[::FRAMES, :3, 3]
+    away = (found - found[:1]) - torch.from_numpy(POSES[1:, :3, 3] - POSES[1:2, :3, 3])
+    assert away.abs().max() < 1e-5
+
+
 @pytest.mark.parametrize(
     ("outer", "inner", "name"),
     [

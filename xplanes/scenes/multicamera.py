@@ -24,9 +24,9 @@ from xplanes.scenes.colmap_model import MODELS, find_model, read_model
 from xplanes.scenes.entries import (
     checked_pose,
     is_positive,
+    origin_near,
     paths_inside,
     require_fetched,
-    require_precision,
     some,
     unit_times,
     world_turn,
@@ -129,6 +129,7 @@ class MultiCameraSettings(SceneSettings):
         watched = _video_camera(cameras, parts, self.video_camera)
         recordings = _simultaneous([_recording(camera) for camera in cameras])
         poses = torch.from_numpy(np.stack([camera.pose for camera in cameras]))
+        poses[:, :3, 3] -= torch.from_numpy(origin_near(folder, poses[:, :3, 3].numpy()))
         images = [image for recording in recordings for image in recording.images[:1]]
         turn, up = world_turn(poses, images if len(images) == len(poses) else (), self.orient)
         if turn is not None:
@@ -345,7 +346,6 @@ def _from_transforms(folder: Path) -> list[Camera]:
 def _from_colmap(folder: Path, place: Path) -> list[Camera]:
     """Cameras of a sparse model with one registered image per camera."""
     model = read_model(place)
-    require_precision(model.source, model.camera_to_world[:, :3, 3])
     sources: dict[str, list[Path]] = defaultdict(list)
     for path in sorted(folder.iterdir()):
         if _is_recording(path):

@@ -137,28 +137,27 @@ class ColmapSettings(CaptureSettings):
         kept, paths = zip(*usable("images", image_of, model.names), strict=True)
         model = model.subset(kept)
         labels = [f"{model.source}: {name}" for name in model.names]
+        # The search does not enter folders that are links.
+        found = {*root.rglob("*")}.union(*(place.iterdir() for place in {p.parent for p in paths}))
         present = {
             path.relative_to(root).as_posix()
-            for path in root.rglob("*")
+            for path in found
             if is_image(path) and path.is_file()
         }
-        used = {path.relative_to(root).as_posix() for path in paths}
-        if rest := sorted(present - used):
+        used = [path.relative_to(root).as_posix() for path in paths]
+        if rest := sorted(present.difference(used)):
             logger.warning(
                 "%d of %d images in %s are not used, because COLMAP did not register them: %s",
                 *(len(rest), len(present), images, some(rest)),
             )
-        times, source = self._times(model.names, labels, present)
+        times, source = self._times(model.names, labels, used, present)
         listing = Listing.checked(
             model.source,
             labels,
             paths,
             model.camera_to_world,
             times,
-            files=tuple(
-                (images.relative_to(self.folder) / path.relative_to(root)).as_posix()
-                for path in paths
-            ),
+            files=tuple((_shown(images, self.folder) / name).as_posix() for name in used),
             calibrations=model.calibrations,
             masks=() if self.masks is None else self._masks(model.names, self.masks),
             time_source=source,
@@ -174,7 +173,7 @@ class ColmapSettings(CaptureSettings):
         return mask_files(self.folder / masks, kinds)
 
     def _times(
-        self, names: Sequence[str], labels: Sequence[str], present: set[str]
+        self, names: Sequence[str], labels: Sequence[str], used: Sequence[str], present: set[str]
     ) -> tuple[list[float], str]:
         """Times from 0 to 1, and their source; no times if the scene is static."""
         if self.static:
@@ -186,7 +185,7 @@ class ColmapSettings(CaptureSettings):
                 return [], ""
             origin = "the numbers in their names"
         elif self.times == "rank":
-            found = _ranks(names, present)
+            found = _ranks(used, present)
             origin = "their order in their folders"
         else:
             path = self.folder / self.times
@@ -293,12 +292,18 @@ def _image_folder(folder: Path, name: str, model: SparseModel) -> Path:
     )
 
 
+def _shown(images: Path, folder: Path) -> Path:
+    """The folder of images as it is in tables: relative to the scene's if it lies inside."""
+    images, folder = images.absolute(), folder.absolute()
+    return images.relative_to(folder) if images.is_relative_to(folder) else Path(images.name)
+
+
 def _matched(names: Sequence[str], labels: Sequence[str], pattern: str) -> list[float]:
     """The number in each name that matches the pattern's group."""
     found: list[float] = []
     for name, label in zip(names, labels, strict=True):
         match = re.search(pattern, name)
-        number = None if match is None else number_in(match[1])
+        number = None if match is None else number_in(match[1] or "")
         if number is None:
             raise SceneError(
                 f"{label} has no number where data.time_pattern={pattern} has its group. "
@@ -314,7 +319,7 @@ def _matched(names: Sequence[str], labels: Sequence[str], pattern: str) -> list[
 
 
 def _ranks(names: Sequence[str], present: set[str]) -> list[float]:
-    """The rank of each image in its folder, counting images that COLMAP did not register."""
+    """The rank of each image file in its folder, counting files that COLMAP did not register."""
     folders: dict[str, list[str]] = defaultdict(list)
     for name in present | set(names):
         folders[_camera(name)].append(name)

@@ -35,7 +35,7 @@ from xplanes.scenes.entries import (
 )
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import Listing, held_out, time_source
-from xplanes.scenes.multicamera import recordings_of_cameras
+from xplanes.scenes.multicamera import POSES, are_registered, recordings_of_cameras
 from xplanes.scenes.name_times import OTHER_TIMES, times_in_names
 from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.views import Scene
@@ -76,7 +76,7 @@ class ColmapSettings(CaptureSettings):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         # A model beside videos of several cameras is their calibration.
-        if len(recordings_of_cameras(folder)) > 1:
+        if len(recordings_of_cameras(folder)) > 1 or are_registered(folder):
             return False
         if find_model(folder, MODELS[:2]) is not None:
             return True
@@ -119,12 +119,15 @@ class ColmapSettings(CaptureSettings):
         listing, folders, points = self._listing(model)
         places = self._places(listing, folders)
         scene = self.capture(listing, places, splits, model.source, points)
-        if points is None or math.isnan(model.error):
-            return scene
-        words = f"{len(points)}, {model.error:.2f} px from where images show them on average"
-        if model.error > DOUBTFUL:
-            words += "; data.refine_cameras=true corrects the cameras in training"
-        return replace(scene, notes={**scene.notes, "points": words})
+        notes = dict(scene.notes)
+        if (self.folder / POSES).is_file():
+            notes["poses"] = f"those of COLMAP; data=llff reads {POSES}, as a static scene"
+        if points is not None and not math.isnan(model.error):
+            words = f"{len(points)}, {model.error:.2f} px from where images show them on average"
+            if model.error > DOUBTFUL:
+                words += "; data.refine_cameras=true corrects the cameras in training"
+            notes["points"] = words
+        return replace(scene, notes=notes)
 
     def _listing(self, model: SparseModel) -> tuple[Listing, list[str], np.ndarray | None]:
         """All images of the capture, the folder of each, and the model's points."""
@@ -140,9 +143,7 @@ class ColmapSettings(CaptureSettings):
         # The search does not enter folders that are links.
         found = {*root.rglob("*")}.union(*(place.iterdir() for place in {p.parent for p in paths}))
         present = {
-            path.relative_to(root).as_posix()
-            for path in found
-            if is_image(path) and path.is_file()
+            path.relative_to(root).as_posix() for path in found if is_image(path) and path.is_file()
         }
         used = [path.relative_to(root).as_posix() for path in paths]
         if rest := sorted(present.difference(used)):

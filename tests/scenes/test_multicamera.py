@@ -451,7 +451,7 @@ def test_keys_of_transforms_mean_what_they_mean_to_nerfstudio(images):
     assert "the z axis of the files" in up(orientation_override="none")
     assert up(up=[0, 2, 0]) == "(0, 1, 0) of the files, by their key up"
     content["frames"][0]["mask_path"] = "mask.png"
-    with told(r"keys that are not read are colour, mask_path, white_transparent\."):
+    with told(r"keys that are not read are 'colour', 'mask_path', 'white_transparent'\."):
         up(white_transparent=True, colour="sRGB", orientation_override="none")
 
 

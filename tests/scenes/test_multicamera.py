@@ -465,6 +465,7 @@ def test_images_that_are_missing_beside_videos(images):
 def test_folders_beside_cameras_are_none(images):
     for name in ("camera_paths", "mv_images/00000", "mv_images/00001"):
         write_images(images / name, rgb(0)[:1])
+    (images / "camera_path.mp4").write_bytes(b"")
     require_all(read(images))
 
 

@@ -311,6 +311,18 @@ def test_models_and_images_are_found_where_programs_leave_them(capture, model, i
     assert found.views().files[0] == f"{images}/frame_000.png".removeprefix("./")
 
 
+def test_images_may_lie_anywhere(capture, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for root in (".", str(tmp_path)):
+        views = capture.views(root=root, images=str(tmp_path / "room/images"))
+        assert views.files[0] == "images/frame_000.png"
+    save(capture.path / "images/mask.png", picture(0))
+    (capture.path / "images").rename(tmp_path / "photos")
+    with told(r"photos/mask\.png is not read"):
+        views = capture.views(images=str(tmp_path / "photos"))
+    assert views.files[0] == "photos/frame_000.png"
+
+
 def test_several_models_or_folders_of_images_are_told_of(capture):
     for name in ("a", "b"):
         shutil.copytree(capture.path / "sparse/0", capture.path / name / "sparse")
@@ -344,8 +356,9 @@ def test_times_are_the_last_numbers_in_names(tmp_path, caplog):
         "c2_010.png -> 10"
     )
     assert capture.views(time_pattern=r"c(\d)").times.tolist() == [0, 0, 1]
-    words = r"c1_020\.png has no number where data\.time_pattern=f\("
-    capture.refused(words, time_pattern=r"f(\d+)")
+    for pattern in (r"f(\d+)", r"c(\D+)?"):
+        words = rf"c1_020\.png has no number where data\.time_pattern={re.escape(pattern)}"
+        capture.refused(words, time_pattern=pattern)
     bare = Capture(tmp_path / "bare", ["a.png", "b.png"])
     with told(r"2 of 2 images have no number, such as a\.png: all images are taken for one time"):
         assert bare.views().times.tolist() == [0, 0]
@@ -388,7 +401,8 @@ def test_times_by_rank_count_what_was_not_registered(tmp_path, caplog):
 
     def times():
         views = capture.views(times="rank")
-        return dict(zip(views.files, views.times.tolist(), strict=True))
+        files = [file.replace("PNG", "png") for file in views.files]
+        return dict(zip(files, views.times.tolist(), strict=True))
 
     expected = {f"images/{name}": index % 5 / 4 for index, name in enumerate(names)}
     assert times() == expected
@@ -396,7 +410,14 @@ def test_times_by_rank_count_what_was_not_registered(tmp_path, caplog):
     expected.pop("images/cam1/1_9.png")
     assert times() == expected
     assert "folders hold" not in caplog.text
-    (capture.path / "images/cam1/1_9.png").unlink()
+    # Files may have other endings than the model's names, and their folder may be a link.
+    outside = (capture.path / "images/cam1").rename(tmp_path / "cam1")
+    (capture.path / "images/cam1").symlink_to(outside)
+    for path in outside.iterdir():
+        path.rename(path.with_suffix(".PNG"))
+    assert times() == expected
+    assert "folders hold" not in caplog.text
+    (outside / "1_9.PNG").unlink()
     times()
     assert "folders hold 4 to 5 images" in caplog.text
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings
+from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings, write_colmap
 from tests.scenes.common import refused
+from xplanes.scenes.colmap import ColmapSettings
 from xplanes.scenes.llff import LlffSettings
 from xplanes.scenes.multicamera import MultiCameraSettings
 
@@ -58,6 +59,25 @@ def test_captures_of_dynamic_scenes_have_the_times_in_their_names(folder):
     assert scene.splits["train"].times[3] == pytest.approx(3 / 9)
     assert "IMG_9.JPG -> 9" in scene.notes["times"]
     assert read(folder, static=True).splits["train"].times.tolist() != [0.0] * COUNT
+
+
+def test_folders_of_camera_paths_are_no_cameras(folder):
+    (folder / "camera_paths").mkdir()
+    assert LlffSettings.recognises(folder)
+    assert not MultiCameraSettings.recognises(folder)
+
+
+def test_models_of_colmap_beside_it_are_preferred(folder):
+    """As Mip-NeRF 360's captures have them."""
+    camera = {1: ("PINHOLE", 2 * WIDTH, 2 * HEIGHT, (70.0, 70.0, float(WIDTH), float(HEIGHT)))}
+    images = [(f"IMG_{index}.JPG", pose, 1, 0) for index, pose in enumerate(poses(COUNT))]
+    write_colmap(folder / "sparse/0", camera, images)
+    assert ColmapSettings.recognises(folder)
+    assert not LlffSettings.recognises(folder)
+    found = settings(ColmapSettings, "colmap", folder, static=True).load(["train"])
+    assert found.notes["poses"].startswith("those of COLMAP; data=llff reads poses_bounds.npy")
+    (folder / "flow").mkdir()
+    assert LlffSettings.recognises(folder)
 
 
 def test_other_numbers_of_images_than_of_rows(folder):

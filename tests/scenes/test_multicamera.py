@@ -24,8 +24,15 @@ from xplanes.optional import MissingExtraError
 from xplanes.scenes import store
 from xplanes.scenes import videos as recordings
 from xplanes.scenes.colmap import ColmapSettings
+from xplanes.scenes.listing import Calibration
 from xplanes.scenes.llff import LlffSettings
-from xplanes.scenes.multicamera import MultiCameraSettings, read_cameras
+from xplanes.scenes.multicamera import (
+    Camera,
+    MultiCameraSettings,
+    Recording,
+    _are_stamped,
+    read_cameras,
+)
 from xplanes.scenes.nerfstudio import NerfstudioSettings
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
@@ -177,6 +184,17 @@ def test_folders_of_images_keep_every_pixel(images):
         require_all(read(images))
 
 
+def test_cameras_in_map_coordinates_are_read_relative_to_a_point_near_them(images):
+    path = images / "poses_bounds.npy"
+    poses = np.load(path)
+    poses[:, [3, 8, 13]] += [500_000, 5_400_000, 300]
+    np.save(path, poses)
+    with told(r"read relative to \(500001, 5399999, 302\)"):
+        found = read(images, orient=False).splits["train"].camera_to_world[::FRAMES, :3, 3]
+    away = (found - found[:1]) - torch.from_numpy(POSES[1:, :3, 3] - POSES[1:2, :3, 3])
+    assert away.abs().max() < 1e-5
+
+
 @pytest.mark.parametrize(
     ("outer", "inner", "name"),
     [
@@ -221,6 +239,45 @@ def test_colmap_may_have_registered_an_image_of_each_camera(images, name, text):
     assert found.video.files == expected.video.files
 
 
+def move(folder: Path, outer: str, name: str = "cam{:02d}") -> None:
+    """Move the cameras of a folder, and rename them."""
+    (folder / outer).mkdir(exist_ok=True)
+    for camera in range(CAMERAS):
+        (folder / f"cam{camera:02d}").rename(folder / outer / name.format(camera))
+
+
+def test_cameras_that_colmap_registered_may_lie_in_one_folder(images):
+    (images / "poses_bounds.npy").unlink()
+    for camera in range(CAMERAS):
+        save(images / "images" / f"cam{camera:02d}" / "1.png", rgb(camera)[0])
+    with_colmap(images, "cam{:02d}.png")
+    move(images, "videos")
+    require_recognised(images)
+    require_all(read(images))
+    # Several images of each camera: cameras that move, with their masks.
+    names = [f"cam{camera:02d}/{number}.png" for camera in range(CAMERAS) for number in range(2)]
+    lens = {1: ("PINHOLE", SIZE, SIZE, (FOCAL, FOCAL, SIZE / 2, SIZE / 2))}
+    write_colmap(images / "sparse" / "0", lens, [(name, POSES[0], 1, 3) for name in names])
+    assert ColmapSettings.recognises(images)
+    assert not MultiCameraSettings.recognises(images)
+
+
+def test_images_of_cameras_as_4dgaussians_counts_them(images):
+    (images / "poses_bounds.npy").unlink()
+    with_colmap(images, lambda camera: f"image{camera + 1}.jpg")
+    (images / "sparse/0").rename(images / "sparse_")
+    require_recognised(images)
+    with told(r"image1, image2, \.\.\. are taken for images of cam00, cam01, cam02, cam03, in"):
+        require_all(read(images))
+
+
+def test_rows_of_poses_have_the_plain_order_of_names(images):
+    move(images, ".", "view_{}")
+    (images / "view_2").rename(images / "view_10")
+    with told("row 0 is view_0, row 1 is view_1, row 2 is view_10"):
+        require_all(read(images, test_cameras=["view_0"]))
+
+
 def test_images_and_cameras_that_do_not_belong_together(copied):
     (copied / "poses_bounds.npy").unlink()
 
@@ -232,7 +289,7 @@ def test_images_and_cameras_that_do_not_belong_together(copied):
     both = r"images\.bin: {}.*Registered images: {}.*cam\*, in .*copied: cam00\.mp4, cam01\.mp4"
     (copied / "images").mkdir()
     with_colmap(copied, plain)
-    assert len(read_cameras(copied)) == CAMERAS
+    assert len(read_cameras(copied)[0]) == CAMERAS
     left = r"left0\.png, left1\.png, left2\.png, left3\.png"
     refuse_model(both.format("left0.png may be of no video or folder", left), "left{}.png")
     refuse_model(
@@ -358,6 +415,46 @@ def test_a_frame_that_one_camera_lacks_is_left_out(images, apart, gone):
     assert torch.equal(views.in_memory(), VIEWS.in_memory()[places])
 
 
+def test_frames_that_all_cameras_lack_are_a_gap_in_time(images):
+    for camera in range(CAMERAS):
+        (images / f"cam{camera:02d}/10.png").rename(images / f"cam{camera:02d}/50.png")
+    scene = read(images)
+    shares = [0, 1 / 45, 2 / 45, 3 / 45, 4 / 45, 1]
+    assert scene.splits["train"].times[:FRAMES].tolist() == pytest.approx(shares)
+    assert scene.splits["train"].files[FRAMES - 1] == "cam01/000005"
+    assert scene.notes["times"] == "the numbers in their names, from 5 to 50"
+    few = read(images, frames=[3, 5, 2])
+    assert few.splits["train"].times[:2].tolist() == [0, 1]
+    assert few.notes["times"] == "the numbers in their names, from 8 to 50"
+    for camera in range(CAMERAS):  # Across a minute, times of day are no numbers of frames.
+        for path in (images / f"cam{camera:02d}").iterdir():
+            second = f"{int(path.stem) % 50:04d}"
+            path.rename(path.with_name(f"IMG_20260102_11{second}.png"))
+    times = read(images).splits["train"].times
+    assert times[:FRAMES].tolist() == pytest.approx(torch.linspace(0, 1, FRAMES).tolist())
+
+
+def test_keys_of_transforms_mean_what_they_mean_to_nerfstudio(images):
+    (images / "poses_bounds.npy").unlink()
+    with_transforms(images, "cam{:02d}")
+    path = images / "transforms.json"
+    content = json.loads(path.read_text())
+    lying = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    for frame, pose in zip(content["frames"], POSES, strict=True):
+        frame["transform_matrix"] = (lying @ pose).tolist()
+
+    def up(**keys) -> str:
+        path.write_text(json.dumps(content | keys))
+        return read(images).notes["up"]
+
+    assert "the world is turned" in up()
+    assert "the z axis of the files" in up(orientation_override="none")
+    assert up(up=[0, 2, 0]) == "(0, 1, 0) of the files, by their key up"
+    content["frames"][0]["mask_path"] = "mask.png"
+    with told(r"keys that are not read are 'colour', 'mask_path', 'white_transparent'\."):
+        up(white_transparent=True, colour="sRGB", orientation_override="none")
+
+
 def test_images_that_are_missing_beside_videos(images):
     write_video(images / "cam03.mp4", rgb(3))
     shutil.rmtree(images / "cam03")
@@ -368,6 +465,7 @@ def test_images_that_are_missing_beside_videos(images):
 def test_folders_beside_cameras_are_none(images):
     for name in ("camera_paths", "mv_images/00000", "mv_images/00001"):
         write_images(images / name, rgb(0)[:1])
+    (images / "camera_path.mp4").write_bytes(b"")
     require_all(read(images))
 
 
@@ -433,7 +531,7 @@ def test_places_of_recordings_that_cannot_be(copied):
 
 def test_cameras_of_images_need_no_pyav(images, monkeypatch, videos):
     monkeypatch.setitem(__import__("sys").modules, "av", None)
-    assert len(read_cameras(images)) == CAMERAS
+    assert len(read_cameras(images)[0]) == CAMERAS
     require_all(read(images))
     refuse(videos, r'pip install "xplanes\[video\]"', error=MissingExtraError)
 
@@ -488,6 +586,26 @@ def test_a_camera_that_begins_later_is_told_of(tmp_path):
     with told(r"cam02\.mkv begins 0\.4 s after .*trim the videos"):
         times = read(folder).splits["train"].times
     assert torch.allclose(times[:FRAMES], torch.linspace(0, 1, FRAMES))
+
+
+def test_times_of_different_rates_are_believed_aloud(tmp_path):
+    folder = stamped(tmp_path, lambda c: [400 * (c == 2) + (40 if c else 33) * n for n in range(6)])
+    with told(r"cam02\.mkv begins 0\.4 s after .*these times are used.*trim the videos"):
+        times = read(folder).splits["train"].times
+    assert times[FRAMES] == pytest.approx(2 / 3, abs=0.01)
+
+
+@pytest.mark.parametrize("fast", range(2))
+@pytest.mark.parametrize(("count", "counts"), [(400, False), (600, True)])
+def test_rates_differ_if_the_cameras_drift_apart(fast, count, counts):
+    rates = [29.97, 29.97]
+    rates[fast] = 30.0
+    camera = Camera("cam00", Path("cam00.mp4"), np.eye(4), Calibration(per_width=1.0), "")
+    each = [Recording(camera, (2, 2), count, r, tuple(n / r for n in range(count))) for r in rates]
+    assert _are_stamped(each) is counts
+    if counts:
+        words = "has 30 frames per second, but .* 29.97, and not all"
+        refused(lambda: _are_stamped([each[0], replace(each[1], times=())]), words)
 
 
 def test_hdr_videos_are_told_of(tmp_path):

@@ -98,6 +98,11 @@ def test_a_file_holds_the_pixels_of_memory(tmp_path, monkeypatch, alpha):
         assert torch.equal(images.silhouette(index), seen), index
     backwards = images.subset(torch.tensor([2, 0]))
     assert torch.equal(backwards.image(0), images.image(2))
+    if hasattr(os, "pread"):  # Forked processes share the position: reading must not move it.
+        assert file._file.tell() == 0
+        monkeypatch.delattr(os, "pread")
+        assert torch.equal(images.image(2), backwards.image(0))
+        assert file._file.tell() > 0
     assert backwards.shape == (2, 130, 129, 4)
     assert torch.equal(copy.deepcopy(backwards).image(1), images.image(0))
     monkeypatch.setattr(store, "IN_MEMORY", 4 * 4 * 130 * 129)

@@ -35,7 +35,7 @@ from xplanes.scenes.entries import (
 )
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import Listing, held_out, time_source
-from xplanes.scenes.multicamera import recordings_of_cameras
+from xplanes.scenes.multicamera import POSES, are_registered, recordings_of_cameras
 from xplanes.scenes.name_times import OTHER_TIMES, times_in_names
 from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.views import Scene
@@ -76,7 +76,7 @@ class ColmapSettings(CaptureSettings):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         # A model beside videos of several cameras is their calibration.
-        if len(recordings_of_cameras(folder)) > 1:
+        if len(recordings_of_cameras(folder)) > 1 or are_registered(folder):
             return False
         if find_model(folder, MODELS[:2]) is not None:
             return True
@@ -119,12 +119,15 @@ class ColmapSettings(CaptureSettings):
         listing, folders, points = self._listing(model)
         places = self._places(listing, folders)
         scene = self.capture(listing, places, splits, model.source, points)
-        if points is None or math.isnan(model.error):
-            return scene
-        words = f"{len(points)}, {model.error:.2f} px from where images show them on average"
-        if model.error > DOUBTFUL:
-            words += "; data.refine_cameras=true corrects the cameras in training"
-        return replace(scene, notes={**scene.notes, "points": words})
+        notes = dict(scene.notes)
+        if (self.folder / POSES).is_file():
+            notes["poses"] = f"those of COLMAP; data=llff reads {POSES}, as a static scene"
+        if points is not None and not math.isnan(model.error):
+            words = f"{len(points)}, {model.error:.2f} px from where images show them on average"
+            if model.error > DOUBTFUL:
+                words += "; data.refine_cameras=true corrects the cameras in training"
+            notes["points"] = words
+        return replace(scene, notes=notes)
 
     def _listing(self, model: SparseModel) -> tuple[Listing, list[str], np.ndarray | None]:
         """All images of the capture, the folder of each, and the model's points."""
@@ -137,28 +140,25 @@ class ColmapSettings(CaptureSettings):
         kept, paths = zip(*usable("images", image_of, model.names), strict=True)
         model = model.subset(kept)
         labels = [f"{model.source}: {name}" for name in model.names]
+        # The search does not enter folders that are links.
+        found = {*root.rglob("*")}.union(*(place.iterdir() for place in {p.parent for p in paths}))
         present = {
-            path.relative_to(root).as_posix()
-            for path in root.rglob("*")
-            if is_image(path) and path.is_file()
+            path.relative_to(root).as_posix() for path in found if is_image(path) and path.is_file()
         }
-        used = {path.relative_to(root).as_posix() for path in paths}
-        if rest := sorted(present - used):
+        used = [path.relative_to(root).as_posix() for path in paths]
+        if rest := sorted(present.difference(used)):
             logger.warning(
                 "%d of %d images in %s are not used, because COLMAP did not register them: %s",
                 *(len(rest), len(present), images, some(rest)),
             )
-        times, source = self._times(model.names, labels, present)
+        times, source = self._times(model.names, labels, used, present)
         listing = Listing.checked(
             model.source,
             labels,
             paths,
             model.camera_to_world,
             times,
-            files=tuple(
-                (images.relative_to(self.folder) / path.relative_to(root)).as_posix()
-                for path in paths
-            ),
+            files=tuple((_shown(images, self.folder) / name).as_posix() for name in used),
             calibrations=model.calibrations,
             masks=() if self.masks is None else self._masks(model.names, self.masks),
             time_source=source,
@@ -174,7 +174,7 @@ class ColmapSettings(CaptureSettings):
         return mask_files(self.folder / masks, kinds)
 
     def _times(
-        self, names: Sequence[str], labels: Sequence[str], present: set[str]
+        self, names: Sequence[str], labels: Sequence[str], used: Sequence[str], present: set[str]
     ) -> tuple[list[float], str]:
         """Times from 0 to 1, and their source; no times if the scene is static."""
         if self.static:
@@ -186,7 +186,7 @@ class ColmapSettings(CaptureSettings):
                 return [], ""
             origin = "the numbers in their names"
         elif self.times == "rank":
-            found = _ranks(names, present)
+            found = _ranks(used, present)
             origin = "their order in their folders"
         else:
             path = self.folder / self.times
@@ -293,12 +293,18 @@ def _image_folder(folder: Path, name: str, model: SparseModel) -> Path:
     )
 
 
+def _shown(images: Path, folder: Path) -> Path:
+    """The folder of images as it is in tables: relative to the scene's if it lies inside."""
+    images, folder = images.absolute(), folder.absolute()
+    return images.relative_to(folder) if images.is_relative_to(folder) else Path(images.name)
+
+
 def _matched(names: Sequence[str], labels: Sequence[str], pattern: str) -> list[float]:
     """The number in each name that matches the pattern's group."""
     found: list[float] = []
     for name, label in zip(names, labels, strict=True):
         match = re.search(pattern, name)
-        number = None if match is None else number_in(match[1])
+        number = None if match is None else number_in(match[1] or "")
         if number is None:
             raise SceneError(
                 f"{label} has no number where data.time_pattern={pattern} has its group. "
@@ -314,7 +320,7 @@ def _matched(names: Sequence[str], labels: Sequence[str], pattern: str) -> list[
 
 
 def _ranks(names: Sequence[str], present: set[str]) -> list[float]:
-    """The rank of each image in its folder, counting images that COLMAP did not register."""
+    """The rank of each image file in its folder, counting files that COLMAP did not register."""
     folders: dict[str, list[str]] = defaultdict(list)
     for name in present | set(names):
         folders[_camera(name)].append(name)

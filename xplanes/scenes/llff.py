@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from xplanes.scenes.colmap import ColmapSettings
 from xplanes.scenes.entries import unit_times
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.images import native_sizes, width_rank
@@ -29,7 +30,9 @@ class LlffSettings(CaptureSettings):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         known = (folder / POSES).is_file() and not recordings_of_cameras(folder)
-        return known and bool(_image_folders(folder))
+        # As in Mip-NeRF 360's captures, COLMAP's model, which has lenses and points, is preferred.
+        kept = _is_dynamic(folder) or not ColmapSettings.recognises(folder)
+        return known and kept and bool(_image_folders(folder))
 
     def load(self, splits: Sequence[str]) -> Scene:
         path = self.folder / POSES
@@ -40,8 +43,8 @@ class LlffSettings(CaptureSettings):
         )
         names = [image.name for image in images]
         labels, poses, calibrations = zip(*read_poses_bounds(path, names), strict=True)
-        dynamic = any((self.folder / name).is_dir() for name in DYNAMIC)
-        times = times_in_names(names) if self.static is False or dynamic else []
+        dynamic = self.static is False or _is_dynamic(self.folder)
+        times = times_in_names(names) if dynamic else []
         listing = Listing.checked(
             path,
             labels,
@@ -55,6 +58,10 @@ class LlffSettings(CaptureSettings):
             else "none, as in LLFF's static captures (data.static=false takes those in the names)",
         )
         return self.capture(listing, held_out(listing, self.eval_every), splits, path)
+
+
+def _is_dynamic(folder: Path) -> bool:
+    return any((folder / name).is_dir() for name in DYNAMIC)
 
 
 def _image_folders(folder: Path) -> list[list[Path]]:

@@ -8,7 +8,7 @@ or one of these images; or COLMAP has registered one image per camera, with the 
 import logging
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar
@@ -20,13 +20,13 @@ from torch import Tensor
 from xplanes.errors import ConfigError, MissingSplitError, SceneError, refuse_all, warn
 from xplanes.files import natural
 from xplanes.scenes import store, videos
-from xplanes.scenes.colmap_model import MODELS, find_model, read_model
+from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, image_count, read_model
 from xplanes.scenes.entries import (
     checked_pose,
     is_positive,
+    origin_near,
     paths_inside,
     require_fetched,
-    require_precision,
     some,
     unit_times,
     world_turn,
@@ -42,8 +42,15 @@ from xplanes.scenes.images import (
     shrink,
 )
 from xplanes.scenes.listing import Calibration, final_intrinsics, misshapen
+from xplanes.scenes.name_times import DATE
 from xplanes.scenes.source import SceneSettings
-from xplanes.scenes.transforms import read_calibration, read_frames
+from xplanes.scenes.transforms import (
+    TRANSPARENT,
+    read_calibration,
+    read_frames,
+    stated_up,
+    warn_of_unknown,
+)
 from xplanes.scenes.views import Scene, Views
 
 logger = logging.getLogger(__name__)
@@ -57,11 +64,14 @@ NUMBERED = re.compile(r"(?i)((view|camera|c|v)[_-]?\d+|\d\d+)")
 TIMESTEPS = "mv_images"
 """Folder with a subfolder for each timestep, as in Nvidia's Dynamic Scenes."""
 
+UNREAD = ("mask_path", *TRANSPARENT, "train_filenames", "val_filenames", "test_filenames")
+"""Keys of transforms files that are read of captures, but not of several fixed cameras."""
+
 IMAGES = ("images", "image", "rgb", "frames")
 """Names of the subfolder with a camera's images, if the camera has several subfolders."""
 
-SAME_RATE = 1e-3
-"""Largest relative difference between frame rates of synchronised cameras."""
+MOST_DRIFT = 0.5
+"""Largest drift between synchronised cameras until the shortest of them ends, in frames."""
 
 LATE = 1.5
 """A longer gap between frames, relative to the median gap, indicates a variable frame rate."""
@@ -106,8 +116,7 @@ class MultiCameraSettings(SceneSettings):
     def recognises(cls, folder: Path) -> bool:
         if (folder / POSES).is_file():
             return bool(_recordings(folder))
-        registered = find_model(folder, MODELS[:2]) is not None
-        return is_rig(folder) or (registered and len(recordings_of_cameras(folder)) > 1)
+        return is_rig(folder) or are_registered(folder)
 
     def load(self, splits: Sequence[str]) -> Scene:
         if self.train_on_video:
@@ -118,7 +127,7 @@ class MultiCameraSettings(SceneSettings):
         folder = self.folder
         if not folder.is_dir():
             raise self.no_scene()
-        cameras = read_cameras(folder)
+        cameras, content = read_cameras(folder)
         parts = _split_cameras(folder, cameras, self.test_cameras)
         for split in splits:
             if split not in parts:
@@ -129,25 +138,32 @@ class MultiCameraSettings(SceneSettings):
         watched = _video_camera(cameras, parts, self.video_camera)
         recordings = _simultaneous([_recording(camera) for camera in cameras])
         poses = torch.from_numpy(np.stack([camera.pose for camera in cameras]))
+        poses[:, :3, 3] -= torch.from_numpy(origin_near(folder, poses[:, :3, 3].numpy()))
         images = [image for recording in recordings for image in recording.images[:1]]
-        turn, up = world_turn(poses, images if len(images) == len(poses) else (), self.orient)
+        shown = images if len(images) == len(poses) else ()
+        turn, up = world_turn(poses, shown, *stated_up(content, self.orient))
         if turn is not None:
             poses[:, :3] = turn @ poses[:, :3]
         stamped = _are_stamped(recordings)
         numbers = _frame_numbers(folder, recordings, self.frames, stamped)
+        times = [
+            [recording.times[number] if stamped else number for number in own]
+            for recording, own in zip(recordings, numbers, strict=True)
+        ]
         whole, owner = _read_views(
-            recordings, poses, numbers, stamped, self.resolution, self.image_cache
+            recordings, poses, numbers, times, self.resolution, self.image_cache
         )
 
         def views_of(chosen: Sequence[int]) -> Views:
             return whole.subset(torch.cat([(owner == camera).nonzero()[:, 0] for camera in chosen]))
 
         chosen = self.thinned({split: views_of(parts[split]) for split in dict.fromkeys(splits)})
-        origin = "the numbers of the frames"
-        if stamped and not images:
-            origin = "when the videos show their frames"
-        last = max(each[-1] for each in numbers)
-        notes = {"times": f"{origin}, from {numbers[0][0]} to {last}", "up": up}
+        origin, unit = "the numbers of the frames", ""
+        if stamped:
+            kinds = ("when the videos show their frames", " s"), ("the numbers in their names", "")
+            origin, unit = kinds[bool(images)]
+        first, last = min(each[0] for each in times), max(each[-1] for each in times)
+        notes = {"times": f"{origin}, from {first:.10g} to {last:.10g}{unit}", "up": up}
         return Scene(folder.resolve().name, chosen, video=views_of([watched]), notes=notes)
 
 
@@ -179,8 +195,8 @@ class Recording:
         size: Height and width of the frames.
         count: Number of frames.
         rate: Frames per second; None for images and if the video has none.
-        times: Presentation times of a video's frames in seconds, or numbers of images if some are
-            left out; empty if unknown. [count]
+        times: Presentation times of a video's frames in seconds, or numbers of images; empty if
+            unknown. [count]
         images: The image files in the order of time; empty for a video. [count]
     """
 
@@ -197,16 +213,21 @@ class Recording:
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
 
 
-def read_cameras(folder: Path) -> list[Camera]:
+def read_cameras(folder: Path) -> tuple[list[Camera], Mapping[str, Any]]:
     """The calibrated cameras of a folder, in the order of its calibration.
+
+    Returns:
+        The cameras, and the content of transforms.json; empty for other calibrations.
 
     Raises:
         SceneError: If it has no calibration, or one that does not fit its videos and images.
     """
+    content: Mapping[str, Any] = {}
     if (folder / POSES).is_file():
         cameras = _from_poses_bounds(folder)
     elif (folder / TRANSFORMS).is_file():
-        cameras = _from_transforms(folder)
+        content = read_frames(folder / TRANSFORMS)
+        cameras = _from_transforms(folder, content)
     elif (model := find_model(folder)) is not None:
         cameras = _from_colmap(folder, model)
     else:
@@ -221,24 +242,36 @@ def read_cameras(folder: Path) -> list[Camera]:
         raise SceneError(
             f"{folder}: several cameras are called {twice[0]}. Rename their videos or folders."
         )
-    return cameras
+    return cameras, content
 
 
 def recordings_of_cameras(folder: Path) -> list[Path]:
     """Videos and folders called cam*, else those with numbers such as 00 or view_01, by name."""
     inside = sorted(filter(_is_recording, folder.iterdir()))
-    numbered = [path for path in inside if NUMBERED.fullmatch(path.stem)]
-    numbered.sort(key=lambda path: natural(path.name))
     named = [path for path in inside if path.name.lower().startswith("cam")]
     # Names with digits take precedence over others, such as camera_paths.
-    return [path for path in named if re.search(r"\d", path.name)] or named or numbered
+    if found := [path for path in named if re.search(r"\d", path.stem)]:
+        return found
+    named = [path for path in named if path.is_file() or _images_in(path)]
+    return named if len(named) > 1 else [p for p in inside if NUMBERED.fullmatch(p.stem)]
 
 
-def _recordings(folder: Path) -> list[Path]:
-    """Recordings in a folder, or in its only subfolder that has some, such as videos."""
+def are_registered(folder: Path) -> bool:
+    """Whether COLMAP registered an image of each of several cameras, not those of a capture."""
+    # A transforms.json that was converted from another model takes precedence.
+    place = find_model(folder, MODELS[:2] if (folder / TRANSFORMS).is_file() else MODELS)
+    if place is None or len(recordings_of_cameras(folder)) > 1:
+        return place is not None
+    found = _recordings(folder, "images")
+    return len(found) > 1 and 1 < image_count(place) <= len(found)
+
+
+def _recordings(folder: Path, *others: str) -> list[Path]:
+    """Recordings in a folder, or in its only subfolder, but for ``others``, that has some."""
     if found := recordings_of_cameras(folder):
         return found
-    inside = [path for path in folder.iterdir() if path.is_dir() and path.name != TIMESTEPS]
+    others = (TIMESTEPS, *others)
+    inside = [path for path in folder.iterdir() if path.is_dir() and path.name not in others]
     deeper = [paths for path in inside if (paths := recordings_of_cameras(path))]
     return deeper[0] if len(deeper) == 1 else []
 
@@ -269,7 +302,14 @@ def _from_poses_bounds(folder: Path) -> list[Camera]:
     path = folder / POSES
     # A video may be beside a folder of images extracted from it.
     sources = list({source.stem: source for source in _recordings(folder)}.values())
-    rows = read_poses_bounds(path, [source.name for source in sources])
+    names = [source.name for source in sources]
+    if names != sorted(names, key=natural):
+        pairs = ", ".join(f"row {row} is {name}" for row, name in enumerate(names[:3]))
+        warn(
+            f"{path}: rows are in the plain order of names, as LLFF writes them: {pairs}. If they "
+            "have the order of the numbers, write these with leading zeros."
+        )
+    rows = read_poses_bounds(path, names)
     return [
         Camera(source.stem, source, pose, calibration, label)
         for source, (label, pose, calibration) in zip(sources, rows, strict=True)
@@ -321,10 +361,9 @@ def read_poses_bounds(
     return cameras
 
 
-def _from_transforms(folder: Path) -> list[Camera]:
+def _from_transforms(folder: Path, content: Mapping[str, Any]) -> list[Camera]:
     """Cameras of transforms.json: one frame per camera, or several with the same pose."""
     path = folder / TRANSFORMS
-    content = read_frames(path)
     cameras: dict[Path, Camera] = {}
     for index, frame in enumerate(content["frames"]):
         label = f"{path}: frame {index} ({frame['file_path']})"
@@ -339,20 +378,23 @@ def _from_transforms(folder: Path) -> list[Camera]:
             continue
         calibration = read_calibration(str(path), content, label, frame)
         cameras[source] = Camera(source.stem, source, pose, calibration, label)
+    warn_of_unknown(path, content, UNREAD)
     return list(cameras.values())
 
 
 def _from_colmap(folder: Path, place: Path) -> list[Camera]:
     """Cameras of a sparse model with one registered image per camera."""
     model = read_model(place)
-    require_precision(model.source, model.camera_to_world[:, :3, 3])
+    recordings = _recordings(folder, "images")
+    folder = recordings[0].parent if recordings else folder
     sources: dict[str, list[Path]] = defaultdict(list)
     for path in sorted(folder.iterdir()):
         if _is_recording(path):
             sources[path.stem].append(path)
     # Other folders, such as images and sparse, need not be cameras.
     expected = {path for paths in sources.values() for path in paths if path.is_file()}
-    expected = sorted(expected | set(recordings_of_cameras(folder)))
+    expected = sorted(expected | set(recordings))
+    sources |= _counted(model, recordings)
     owned: dict[Path, list[str]] = {path: [] for path in expected}
     cameras, problems = [], []
     for name, pose, calibration in zip(
@@ -385,6 +427,22 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
             "camera elsewhere, or read all registered images with data=colmap."
         )
     return cameras
+
+
+def _counted(model: SparseModel, recordings: Sequence[Path]) -> dict[str, list[Path]]:
+    """Recordings by image1, image2, ..., in order; empty if images have other names.
+
+    4DGaussians copies an image of each camera to these names.
+    """
+    named = {path.stem: path for path in recordings}
+    counted = {f"image{place}": [path] for place, path in enumerate(named.values(), start=1)}
+    if sorted(counted) != sorted(PurePosixPath(name).stem for name in model.names):
+        return {}
+    warn(
+        f"{model.source}: image1, image2, ... are taken for images of {some([*named])}, in this "
+        "order. If they are not, give them the cameras' names."
+    )
+    return counted
 
 
 def _source(label: str, folder: Path, name: Any) -> Path:
@@ -486,44 +544,47 @@ def _images_in(folder: Path) -> list[Path]:
 
 
 def _are_stamped(recordings: Sequence[Recording]) -> bool:
-    """Whether to use the files' time stamps: if frame rates differ, or vary within a video.
+    """Whether to use the recordings' times: if frame rates differ, or frames are unevenly spaced.
 
-    Otherwise frames with the same number are simultaneous; warns if videos begin at different
+    Otherwise frames with the same number are simultaneous. Warns if videos begin at different
     times.
 
     Raises:
         SceneError: If rates differ and a recording has no times.
     """
-    timed = [(each.camera.source, each.rate) for each in recordings if each.rate]
-    other = next((t for t in timed if abs(t[1] / timed[0][1] - 1) > SAME_RATE), None)
+    timed = sorted((r.rate, r.camera.source) for r in recordings if r.rate) or [(1.0, Path())]
+    (slow, first), (fast, other) = timed[0], timed[-1]
+    drifts = (fast / slow - 1) * min(recording.count for recording in recordings) > MOST_DRIFT
     uneven = any(
         recording.step and np.diff(recording.times).max() > LATE * recording.step
         for recording in recordings
     )
-    if (uneven or other) and all(recording.times for recording in recordings):
-        return True
-    if other is not None:
+    stamped = (uneven or drifts) and all(recording.times for recording in recordings)
+    if drifts and not stamped:
         raise SceneError(
-            f"{other[0]} has {other[1]:g} frames per second, but {timed[0][0]} {timed[0][1]:g}, "
-            "and not all cameras' files have times of their frames. Encode all videos at one "
-            f"rate: ffmpeg -i {other[0].name} -r {timed[0][1]:g} NEW.mp4"
+            f"{other} has {fast:g} frames per second, but {first} {slow:g}, and not all cameras' "
+            "files have times of their frames. Encode all videos at one rate: ffmpeg -i "
+            f"{other.name} -r {slow:g} NEW.mp4"
         )
     begun = [(r.times[0], r.camera.source, r.step) for r in recordings if r.times]
     if begun:
         (early, first, step), (late, last, _) = min(begun), max(begun)
         if late - early > 0.5 * step > 0:
+            what = "frames of equal number are taken to be simultaneous"
             warn(
-                f"{last} begins {late - early:.3g} s after {first}: frames of equal number are "
-                "taken to be simultaneous. If they are not, trim the videos to a common start."
+                f"{last} begins {late - early:.3g} s after {first}: "
+                f"{'these times are used' if stamped else what}. If that is wrong, trim the videos "
+                "to a common start."
             )
-    return False
+    return stamped
 
 
 def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
     """The recordings, without images of timesteps that some cameras lack; warns about these images.
 
     Images of equal numbers are simultaneous. If the cameras' numbers do not overlap, they are
-    counted from the first of each camera.
+    counted from the first of each camera. They become the images' times, as all cameras may lack
+    the same ones.
 
     Raises:
         SceneError: If images are missing, and other cameras have videos.
@@ -545,22 +606,29 @@ def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
         for number, path in zip(own, recordings[camera].images, strict=True)
         if number not in common
     }
-    if not lost:
-        return list(recordings)
-    text = (
-        f"{recordings[0].camera.source.parent}: frames must be simultaneous, but not all cameras "
-        f"have an image of the numbers of {some(sorted(lost, key=natural))}"
-    )
+    if lost:
+        text = (
+            f"{recordings[0].camera.source.parent}: frames must be simultaneous, but not all "
+            f"cameras have an image of the numbers of {some(sorted(lost, key=natural))}"
+        )
+        if len(numbers) < len(recordings):
+            raise SceneError(f"{text}. Add what is missing, or extract the images of all videos.")
+        warn(f"{text}. {len(lost)} images are left out.")
     if len(numbers) < len(recordings):
-        raise SceneError(f"{text}. Add what is missing, or extract the images of all videos.")
-    warn(f"{text}. {len(lost)} images are left out.")
+        return list(recordings)
     chosen = []
     for camera, own in numbers.items():
         kept = [place for place, number in enumerate(own) if number in common]
         images = tuple(recordings[camera].images[place] for place in kept)
-        times = tuple(float(own[place]) for place in kept)
+        times = tuple(own[place] for place in kept) if _are_series(images) else ()
         chosen.append(replace(recordings[camera], count=len(kept), images=images, times=times))
     return chosen
+
+
+def _are_series(images: Sequence[Path]) -> bool:
+    """Whether names differ only in their last number, and it is no time of day."""
+    names = {re.sub(r"\d+(?=\D*$)", "", path.stem) for path in images}
+    return len(names) == 1 and not any(DATE.search(path.stem) for path in images)
 
 
 def _frame_numbers(
@@ -594,7 +662,7 @@ def _read_views(
     recordings: Sequence[Recording],
     poses: Tensor,
     numbers: Sequence[range],
-    stamped: bool,
+    times: Sequence[Sequence[float]],
     resolution: int | None,
     cache: Path | None,
 ) -> tuple[Views, Tensor]:
@@ -635,11 +703,10 @@ def _read_views(
         ),
         cache,
     )
-    stamps = [recording.times[number] if stamped else number for recording, number in frames]
     views = Views(
         pixels,
         poses[camera].float(),
-        torch.tensor(unit_times(stamps)),
+        torch.tensor(unit_times([time for own in times for time in own])),
         intrinsics.subset(camera),
         tuple(f"{recording.camera.name}/{number:06d}" for recording, number in frames),
     )

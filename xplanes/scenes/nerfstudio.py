@@ -1,21 +1,16 @@
 """Captures in the format of nerfstudio and instant-ngp: one transforms.json and its images."""
 
-import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar
-
-import torch
-from torch import Tensor
 
 from xplanes.errors import BrokenFrameError, SceneError, first_of, warn
 from xplanes.scenes.entries import image_path, short
 from xplanes.scenes.listing import Listing, held_out
 from xplanes.scenes.multicamera import is_rig
 from xplanes.scenes.source import CaptureSettings
-from xplanes.scenes.transforms import listing_of, read_frames
+from xplanes.scenes.transforms import listing_of, read_frames, stated_up
 from xplanes.scenes.views import Scene
 
 SPLITS = ("train", "val", "test")
@@ -48,18 +43,8 @@ class NerfstudioSettings(CaptureSettings):
         places = _listed_splits(path, content, listing) or held_out(listing, self.eval_every)
         if "train" in splits and not places.get("train"):
             raise SceneError(f'{path} has no frames to train on: fill "train_filenames".')
-        stays = self.orient is None and content.get("orientation_override") == "none"
-        settings = replace(self, orient=False) if stays else self
-        return settings.capture(listing, places, splits, path, up=_up(content))
-
-
-def _up(content: Mapping[str, Any]) -> Tensor | None:
-    """instant-ngp's up vector, of length 1; None if there is none. float64 [3]"""
-    with suppress(TypeError, ValueError, RuntimeError):
-        up = torch.tensor(content.get("up"), dtype=torch.float64)
-        if up.shape == (3,) and 0 < float(up.norm()) < math.inf:
-            return up / up.norm()
-    return None
+        orient, up = stated_up(content, self.orient)
+        return replace(self, orient=orient).capture(listing, places, splits, path, up=up)
 
 
 def _listed_splits(

@@ -83,7 +83,7 @@ def warn_of_masks(folder: Path, images: Sequence[Path]) -> None:
         if path.is_dir() or is_image(path)
     )
     if found:
-        names = some([path.relative_to(folder).as_posix() for path in found])
+        names = some([path.as_posix().removeprefix(f"{folder.as_posix()}/") for path in found])
         place = found[0] if found[0].is_dir() else found[0].parent
         warn(
             f"{folder}: {names} is not read. If these are masks of the images, name their folder "
@@ -106,7 +106,9 @@ class SceneSettings(Settings, ABC):
     eval_split: Literal["test", "val"] | None  # Split to score; null: val, then test at the end.
     eval_views: Count | None  # Maximum views per scored split, spread over time; null for all.
     half_side: Positive | None  # Half the side of the scene's bounding cube; null estimates it.
-    centre: Sequence[float] | None  # Its centre, three world coordinates; null estimates it.
+    # Its centre: three coordinates in the world after turning (data.orient), as in the line cube of
+    # xplanes inspect; null estimates it.
+    centre: Sequence[float] | None
     refine_cameras: bool  # Correct the poses of the training cameras while the field is trained.
     cache: Location | None  # Folder for images too large for memory; null: the user's cache.
 

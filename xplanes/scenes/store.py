@@ -128,9 +128,12 @@ class PixelFile:
         if isinstance(self.source, np.ndarray):
             return self.source[offset : offset + length]
         assert self._file is not None
-        with self._turn:
-            self._file.seek(offset)
-            content = self._file.read(length)
+        if hasattr(os, "pread"):  # Forked processes share the position in the file.
+            content = os.pread(self._file.fileno(), length, offset)
+        else:
+            with self._turn:
+                self._file.seek(offset)
+                content = self._file.read(length)
         if len(content) < length:
             raise StorageError(
                 f"{self.source} ends too early: it was truncated while in use. Delete it and start "

@@ -9,6 +9,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from xplanes.errors import BrokenFrameError, MissingSplitError, SceneError, warn
 from xplanes.scenes.cameras import focal_length
@@ -165,7 +167,7 @@ def listing_of(
         clear=tuple(level for key, level in TRANSPARENT.items() if content.get(key)),
         time_source=source,
     )
-    _warn_of_unknown(path, content)
+    warn_of_unknown(path, content)
     return listing
 
 
@@ -332,8 +334,8 @@ def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> C
     return replace(camera, per_width=None, **sides)
 
 
-def _warn_of_unknown(path: Path, content: Mapping[str, Any]) -> None:
-    """Warn about unknown keys, which may affect images or cameras."""
+def warn_of_unknown(path: Path, content: Mapping[str, Any], unread: Sequence[str] = ()) -> None:
+    """Warn about unknown and unread keys, which may affect images or cameras."""
     entries = (content, *content["frames"])
     given = {
         key
@@ -341,7 +343,7 @@ def _warn_of_unknown(path: Path, content: Mapping[str, Any]) -> None:
         for key, value in each.items()
         if _has_content(value) or "color" in key  # Zeros in a colour mean black.
     }
-    if unknown := sorted(given - {*KNOWN, *IGNORED}):
+    if unknown := sorted(given - ({*KNOWN, *IGNORED} - {*unread})):
         warn(
             f"{path}: keys that are not read are {', '.join(map(short, unknown))}. If one of them "
             "affects the images or cameras, convert these and remove the key."
@@ -418,6 +420,26 @@ def read_frames(path: Path) -> dict[str, Any]:
                 "key."
             )
     return _standard(path, content) | {"frames": [_standard(path, each) for each in frames]}
+
+
+def stated_up(content: Mapping[str, Any], orient: bool | None) -> tuple[bool | None, Tensor | None]:
+    """What a file says of its world's axes.
+
+    Args:
+        content: Result of `read_frames`.
+        orient: The setting ``data.orient``.
+
+    Returns:
+        The setting, false if it is null and nerfstudio's orientation_override is none; and
+        instant-ngp's up vector, of length 1, float64 [3], or None if there is none.
+    """
+    if orient is None and content.get("orientation_override") == "none":
+        orient = False
+    with suppress(TypeError, ValueError, RuntimeError):
+        up = torch.tensor(content.get("up"), dtype=torch.float64)
+        if up.shape == (3,) and 0 < float(up.norm()) < math.inf:
+            return orient, up / up.norm()
+    return orient, None
 
 
 def _key(entries: Sequence[Mapping[str, Any]]) -> str:

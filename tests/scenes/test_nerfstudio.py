@@ -148,6 +148,7 @@ def test_lists_of_file_names_are_the_splits(capture):
         ({"val_filenames": "a"}, "val_filenames is 'a', not a list"),
         ({"val_filenames": ["../x.png"]}, "val_filenames leaves the scene's folder"),
         ({"val_filenames": ..., "train_filenames": []}, "no frames to train on"),
+        ({"test_filenames": []}, "no frames to train on: fill"),
     ):
         capture.change(**changes)
         capture.refused(words)
@@ -668,6 +669,11 @@ def test_smaller_copies_stand_in_for_images_that_are_missing(capture):
         found = capture.train(resolution=12)
     assert found.files[0].startswith("images_4/")
     assert_same_rays(found, 1, whole, 1)
+    names = [frame["file_path"] for frame in capture.frames()]
+    capture.change(train_filenames=[f"./{name}" for name in names[:6]], val_filenames=names[6:])
+    with told("10 of 10 images are missing and read from smaller"):
+        parts = capture.read(("train", "val")).splits.values()
+    assert [numbers(views) for views in parts] == [[0, 1, 2, 3, 4, 5], [6, 7, 8, 9]]
     capture.change(w=..., h=...)
     capture.refused("no image .*images/frame_00000", error=MissingSplitError)
 

@@ -86,8 +86,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         same = [path for path in found if _normalised(path.name) == _normalised(image.name)]
         if len(chosen := same or found) == 1:
             return _with_content(label, chosen[0])
-    if (spelt := unquote(name)) != name:  # Percent-encoded, as in URLs.
-        return image_path(label, folder, spelt, key)
+    if (plain := unquote(name)) != name:  # Percent-encoded, as in URLs.
+        return image_path(label, folder, plain, key)
     if Path(name).is_absolute() and Path(name).is_file():
         raise BrokenFrameError(
             f"{label}: {key} leaves the scene's folder {folder}. Put a link to {Path(name).parent} "
@@ -169,6 +169,11 @@ def _like(folder: Path) -> Path | None:
     return names[0] if len(names) == 1 and names[0].is_dir() else None
 
 
+def spelt(name: Any) -> str:
+    """A name in one spelling: with slashes, and without . and .. where they change nothing."""
+    return os.path.normpath(str(name).replace("\\", "/"))
+
+
 def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) -> Iterator[Path]:
     """Paths that a name may refer to inside ``folder``, unchanged and with image suffixes.
 
@@ -187,7 +192,7 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
     if not isinstance(name, str) or not name or "\0" in name:
         raise SceneError(f"{label}: {key} is {short(name)}; it must be text such as {example}.")
     # Blender on Windows writes backslashes.
-    whole = Path(os.path.normpath(folder / name.replace("\\", "/")))
+    whole = Path(os.path.normpath(folder / spelt(name)))
     parts = whole.parts
     if whole.is_relative_to(folder):
         parts = whole.relative_to(folder).parts

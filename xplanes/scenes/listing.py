@@ -111,6 +111,7 @@ class Listing:
             pixels are to be ignored); empty if it does not define it.
         clear: Grey levels, out of 255, that are transparent in its images.
         time_source: Source of the times, with examples; empty if there are no times.
+        names: Their names in the file of the cameras; empty if nothing else refers to them. [V]
         origin: Origin of the poses in the files' world.
     """
 
@@ -124,6 +125,7 @@ class Listing:
     mask_meaning: str = ""
     clear: tuple[int, ...] = ()
     time_source: str = ""
+    names: tuple[str, ...] = ()
     origin: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __len__(self) -> int:
@@ -183,7 +185,8 @@ class Listing:
     def subset(self, indices: Sequence[int]) -> "Listing":
         """The images at ``indices``, in that order. [K]"""
         chosen = list(indices)
-        each = {name: getattr(self, name) for name in ("paths", "files", "calibrations", "masks")}
+        lists = ("paths", "files", "names", "calibrations", "masks")
+        each = {name: getattr(self, name) for name in lists}
         kept = {name: tuple(part[i] for i in chosen) for name, part in each.items() if part}
         poses, times = self.camera_to_world[chosen], self.times[chosen]
         return replace(self, camera_to_world=poses, times=times, **kept)

@@ -164,6 +164,7 @@ def listing_of(
         mask_meaning=meaning,
         clear=tuple(level for key, level in TRANSPARENT.items() if content.get(key)),
         time_source=source,
+        names=tuple(frame.entry["file_path"] for frame in frames),
     )
     _warn_of_unknown(path, content)
     return listing

@@ -674,6 +674,12 @@ def test_smaller_copies_stand_in_for_images_that_are_missing(capture):
     with told("10 of 10 images are missing and read from smaller"):
         parts = capture.read(("train", "val")).splits.values()
     assert [numbers(views) for views in parts] == [[0, 1, 2, 3, 4, 5], [6, 7, 8, 9]]
+    capture.put("masks/{}.png", np.full((2 * SIZE, 2 * SIZE), 255, np.uint8))
+    capture.put("masks_4/{}.png", disc())
+    for index, name in enumerate(names):
+        capture.change(index, mask_path=name.replace("images", "masks"))
+    with told("read from smaller|Both readings"):
+        assert_shown(capture.train(mask_use="ignore"), disc())
     capture.change(w=..., h=...)
     capture.refused("no image .*images/frame_00000", error=MissingSplitError)
 

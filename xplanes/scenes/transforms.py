@@ -20,6 +20,7 @@ from xplanes.scenes.entries import (
     number_in,
     read_object,
     short,
+    spelt,
     unit_times,
     usable,
 )
@@ -190,19 +191,10 @@ def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame
     def read(item: tuple[int, dict[str, Any]]) -> _Frame:
         index, entry = item
         label = f"{path}: frame {index} ({entry['file_path']})"
-        try:
-            image = image_path(label, folder, entry["file_path"])
-        except BrokenFrameError:
-            sized = entry.get("w") or content.get("w")  # Else focal lengths would be wrong.
-            found = _downscaled(folder, entry["file_path"]) if sized else None
-            if found is None:
-                raise
-            smaller.append(image := found)
+        image, mask, is_smaller = _files_of(label, folder, content, entry)
+        if is_smaller:
+            smaller.append(image)
         pose = checked_pose(label, entry["transform_matrix"])
-        mask = entry.get("mask_path") or content.get("mask_path") or None
-        mask = None if mask is None else image_path(label, folder, mask, "mask_path")
-        if mask == image:
-            raise BrokenFrameError(f"{label}: there is no mask of the name that mask_path gives.")
         if timed and entry.get(key) is None:
             problem = SceneError if 2 * timed <= len(entries) else BrokenFrameError
             raise problem(
@@ -221,11 +213,39 @@ def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame
     return frames
 
 
-def _downscaled(folder: Path, name: str) -> Path | None:
-    """The largest of nerfstudio's smaller copies of an image, as in images_2; None without any."""
-    wanted = PurePosixPath(name)
-    copies = (folder / f"{wanted.parent}_{factor}" / wanted.name for factor in (2, 4, 8))
-    return next((copy for copy in copies if wanted.parent.name and copy.is_file()), None)
+def _files_of(
+    label: str, folder: Path, content: Mapping[str, Any], entry: Mapping[str, Any]
+) -> tuple[Path, Path | None, bool]:
+    """Image and mask of a frame, and whether the image is a smaller copy of a missing one."""
+    sized, wanted = (entry.get(key) or content.get(key) for key in ("w", "mask_path"))
+    name, factors = entry["file_path"], []
+    try:
+        image = image_path(label, folder, name)
+    except BrokenFrameError:
+        # Without a size, focal lengths would be wrong.
+        found = _copy(label, folder, name, (2, 4, 8)) if sized else None
+        if found is None:
+            raise
+        image, *factors = found
+    mask = None
+    if wanted:
+        found = _copy(label, folder, wanted, factors, "mask_path")
+        mask = found[0] if found else image_path(label, folder, wanted, "mask_path")
+    if mask == image:
+        raise BrokenFrameError(f"{label}: there is no mask of the name that mask_path gives.")
+    return image, mask, bool(factors)
+
+
+def _copy(
+    label: str, folder: Path, name: Any, factors: Sequence[int], key: str = "file_path"
+) -> tuple[Path, int] | None:
+    """The first of nerfstudio's smaller copies of a file, as in images_2, and its factor."""
+    wanted = PurePosixPath(spelt(name))
+    for factor in factors if wanted.parent.name else ():
+        with suppress(BrokenFrameError):
+            copy = f"{wanted.parent}_{factor}/{wanted.name}"
+            return image_path(label, folder, copy, key), factor
+    return None
 
 
 def _warn_of_selection(path: Path, content: Mapping[str, Any]) -> None:

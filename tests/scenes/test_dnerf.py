@@ -377,6 +377,36 @@ def test_masks_become_alpha(scene):
     assert np.abs(found - expected).max() <= 0.5 + 1e-3
 
 
+def test_masks_mean_the_same_whichever_parts_are_read(scene):
+    """A file that is the mask of several images is no silhouette, not even that of a lone one."""
+    scene.add("test", 1)
+    bars = np.zeros((12, 12), np.uint8)
+    bars[4:8] = 255
+    save(scene.path / "mask.png", bars)
+    for split in ("train", "test"):
+        scene.change(split=split, mask_path="mask.png")
+    for splits in (["train", "test"], ["test"], ["train"]):
+        shown = scene.read(splits, views=1).splits[splits[-1]].shown(0)
+        assert torch.equal(shown, torch.from_numpy(bars > 0)), splits
+    scene.change(split="test", mask_path=...)
+    assert scene.read(["test"], mask_use="lrm").splits["test"].ignored is None
+    scene.change(mask_path=...)
+    scene.refused("no training image has a mask file", mask_use="lrm")
+
+
+def test_masks_of_the_video_mean_what_those_of_other_images_do(scene):
+    scene.add("video", 3, fixed=True)
+    bars = np.zeros((12, 12), np.uint8)
+    bars[4:8] = 255
+    for split in ("train", "video"):
+        for index in range(len(scene.frames(split))):
+            save(scene.path / split / f"dynamic_mask_r_{index}.png", bars)
+    found = scene.read()
+    for views in (found.splits["train"], found.video):
+        assert torch.equal(views.shown(0), torch.from_numpy(bars == 0))
+        assert views.image(0)[bars == 0][:, 3].any()
+
+
 MATRIX = np.array(pose(1))
 REFUSED_FRAMES = [
     ("file_path", ..., '"file_path"'),

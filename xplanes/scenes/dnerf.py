@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import ClassVar
 
 from xplanes.errors import MissingSplitError, SceneError, warn
-from xplanes.scenes.listing import Listing, read_views
+from xplanes.scenes.listing import Listing
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.source import SceneSettings, warn_of_masks
-from xplanes.scenes.transforms import listing_of, read_frames, time_span
+from xplanes.scenes.transforms import all_masks, listing_of, read_frames, readable, time_span
 from xplanes.scenes.views import Scene
 
 PARTS = ("train", "val", "test", "video")
-"""Parts that share a unit of time: splits, and the video of a fixed camera."""
+"""Parts that share a unit of time, and the meaning of masks: splits, and a fixed camera's video."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,15 +60,14 @@ def read_scene(settings: SceneSettings, splits: Sequence[str], mask_use: MaskUse
     if not any(folder.glob("transforms_*.json")):
         raise settings.no_scene()
     paths = {split: _transforms_path(folder, split) for split in dict.fromkeys(splits)}
-    span = time_span([folder / f"transforms_{part}.json" for part in PARTS])
+    contents = readable([folder / f"transforms_{part}.json" for part in PARTS])
+    span = time_span(contents.values())
     listed = {split: _listed(split, path, span) for split, path in paths.items()}
     listed = settings.thinned(listed)
     video = _list_video(folder, span)
     _require_times(folder, listed, video)
-    frames = None
-    if video is not None:
-        frames = read_views(video, settings.resolution, settings.image_cache)
-    return settings.scene_of(listed, mask_use, video=frames)
+    # Masks mean the same whichever parts are read.
+    return settings.scene_of(listed, mask_use, all_masks(contents), video=video)
 
 
 def _listed(split: str, path: Path, span: tuple[float, float] | None) -> Listing:

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -112,14 +112,40 @@ SYNONYMS = {"sx1": "s1", "sy1": "s3"}
 """COLMAP's names of a fisheye lens's prism coefficients."""
 
 
-def time_span(paths: Sequence[Path]) -> tuple[float, float] | None:
-    """First and last time in several transforms files; None if no frame has a time."""
-    times = []
+def readable(paths: Sequence[Path]) -> dict[Path, dict[str, Any]]:
+    """Contents of those of several transforms files that `read_frames` can read."""
+    found = {}
     for path in paths:
         with suppress(SceneError):
-            entries = read_frames(path)["frames"]
-            times += [entry[key] for entry in entries if is_number(entry.get(key := _key([entry])))]
+            found[path] = read_frames(path)
+    return found
+
+
+def time_span(contents: Iterable[Mapping[str, Any]]) -> tuple[float, float] | None:
+    """First and last time in several transforms files; None if no frame has a time."""
+    entries = [entry for content in contents for entry in content["frames"]]
+    times = [entry[key] for entry in entries if is_number(entry.get(key := _key([entry])))]
     return (min(times), max(times)) if times else None
+
+
+def all_masks(contents: Mapping[Path, Mapping[str, Any]]) -> tuple[list[Path | None], str]:
+    """Masks of the usable images in several transforms files, and their meaning.
+
+    Args:
+        contents: Result of `readable`.
+
+    Returns:
+        As ``masks`` and ``mask_meaning`` of `Listing`.
+    """
+    masks, meaning = [], ""
+    for path, content in contents.items():
+        pairs = []
+        for entry in content["frames"]:
+            with suppress(SceneError):
+                pairs.append(_files_of("", path.parent.resolve(), content, entry)[:2])
+        found, told = _masks(pairs)
+        masks, meaning = masks + found, meaning or told
+    return masks, meaning
 
 
 def listing_of(
@@ -146,9 +172,7 @@ def listing_of(
     folder = path.parent.resolve()
     frames = _usable(path, content, folder)
     paths = [frame.image for frame in frames]
-    masks, meaning = [frame.mask for frame in frames], ""
-    if not any(masks):
-        masks, meaning = _masks_beside(paths)
+    masks, meaning = _masks([(frame.image, frame.mask) for frame in frames])
     times, source = _times(path, frames, span)
     if content.get("enable_ray_loading", True):
         _warn_of_rays(path, paths)
@@ -264,13 +288,15 @@ def _warn_of_selection(path: Path, content: Mapping[str, Any]) -> None:
         )
 
 
-def _masks_beside(paths: Sequence[Path]) -> tuple[list[Path | None], str]:
-    """Masks beside images, with instant-ngp's names, and their meaning."""
+def _masks(pairs: Sequence[tuple[Path, Path | None]]) -> tuple[list[Path | None], str]:
+    """Masks of images, or else those beside them with instant-ngp's names, and their meaning."""
+    if any(mask for _, mask in pairs):
+        return [mask for _, mask in pairs], ""
     for meaning, patterns in BESIDE.items():
-        names = [[p.format(stem=path.stem, suffix=path.suffix) for p in patterns] for path in paths]
         found = [
-            next((mask for name in each if (mask := path.with_name(name)).is_file()), None)
-            for path, each in zip(paths, names, strict=True)
+            next((mask for name in names if (mask := path.with_name(name)).is_file()), None)
+            for path, _ in pairs
+            if (names := [p.format(stem=path.stem, suffix=path.suffix) for p in patterns])
         ]
         if any(found):
             return found, meaning

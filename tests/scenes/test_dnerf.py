@@ -16,6 +16,7 @@ from tests.captures import save, settings
 from tests.scenes.common import ANGLE, SceneFolder, pose, refused, rgba, told
 from xplanes.components import build
 from xplanes.config import compose_plain
+from xplanes.errors import MissingSplitError
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.scenes.images import load_images, load_premultiplied
@@ -296,6 +297,18 @@ def test_other_names_of_an_image_find_it(scene, name):
     views = scene.train()
     assert views.files == expected.files
     assert torch.equal(views.image(1), expected.image(1))
+
+
+def test_images_of_another_split_are_not_found_for_those_that_are_missing(scene):
+    scene.add("test", 2)
+    (scene.path / "train").rename(scene.path / "images")
+    shutil.rmtree(scene.path / "test")
+    scene.change_each(file_path=lambda name: name.replace("train/", "images/"))
+    with told(r"test split is left out.*test/r_0\): no image"):
+        scene.refused("no image", splits=["train", "test"], error=MissingSplitError)
+    scene.change_each("test", file_path=lambda name: f"C:\\ball\\{name}".replace("test", "images"))
+    with told(r"2 of 2 images of the test split, such as C:/ball/images/r_0, are found only as"):
+        scene.read(["train", "test"])
 
 
 def test_links_are_followed(scene):

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from xplanes.errors import MissingSplitError, SceneError, warn
+from xplanes.scenes.entries import spelt
 from xplanes.scenes.listing import Listing
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.source import SceneSettings, warn_of_masks
@@ -63,6 +64,7 @@ def read_scene(settings: SceneSettings, splits: Sequence[str], mask_use: MaskUse
     contents = readable([folder / f"transforms_{part}.json" for part in PARTS])
     span = time_span(contents.values())
     listed = {split: _listed(split, path, span) for split, path in paths.items()}
+    _warn_of_shared_files(folder, listed)
     listed = settings.thinned(listed)
     video = _list_video(folder, span)
     _require_times(folder, listed, video)
@@ -80,6 +82,20 @@ def _listed(split: str, path: Path, span: tuple[float, float] | None) -> Listing
             more = " No other frame of it can be used either." if others else ""
             warn(f"The {split} split is left out. {first}{more}")
         raise
+
+
+def _warn_of_shared_files(folder: Path, parts: Mapping[str, Listing]) -> None:
+    """Warn if scored splits show files of training images, found under other names."""
+    if (train := parts.get("train")) is None:
+        return
+    names = {image: spelt(name) for image, name in zip(train.paths, train.names, strict=True)}
+    for split, part in parts.items():
+        pairs = zip(part.paths, map(spelt, part.names), strict=True)
+        if shared := [name for image, name in pairs if names.get(image, name) != name]:
+            warn(
+                f"{folder}: {len(shared)} of {len(part)} images of the {split} split, such as "
+                f"{shared[0]}, are found only as files of training images. Add those of the split."
+            )
 
 
 def _require_times(folder: Path, parts: Mapping[str, Listing], video: Listing | None) -> None:

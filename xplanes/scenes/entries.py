@@ -55,8 +55,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
 
     The suffix may be missing or that of another format, and the name may differ in case or in the
     encoding of accents, as long as only one file matches; it may be percent-encoded. If a path does
-    not exist, such as one of another machine, its first folders are dropped. A name without folders
-    is also tried in images.
+    not exist, such as one of another machine, its first folders are dropped; a relative name keeps
+    its last folder. A name without folders is also tried in images.
 
     Args:
         label: The file and frame that name it, for messages.
@@ -73,7 +73,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         if image.is_file():
             return _with_content(label, image)
         choices.append(image)
-    inside = [folder / "images" / path.name for path in choices if path.parent == folder]
+    bare = "/" not in spelt(name)
+    inside = [folder / "images" / path.name for path in choices if bare]
     for image in inside:
         if image.is_file():
             return _with_content(label, image)
@@ -201,8 +202,10 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
             f"{label}: {key} leaves the scene's folder {folder} (it is {name}). Put its files "
             f"inside the folder and correct {key}."
         )
-    # If the path does not exist, its first folders are dropped one by one.
-    for first in range(max(1, len(parts))):
+    # If the path does not exist, its first folders are dropped one by one. The last one of a
+    # relative name tells apart files such as train/0001.png and test/0001.png.
+    least = 1 if PureWindowsPath(name).anchor else 2
+    for first in range(max(1, len(parts) - least + 1)):
         relative = Path(*parts[first:])
         if relative.is_absolute() or (first and not (folder / relative).parent.is_dir()):
             continue

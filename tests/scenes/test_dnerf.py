@@ -279,6 +279,7 @@ def test_resolutions_that_images_do_not_have(scene):
     save(scene.image(3), rgba(0, 8)[:6])
     assert scene.train(resolution=4).size(3) == (3, 4)
     scene.refused("data.resolution=9 is more than the 8 pixels", "r_3.png", resolution=9)
+    scene.refused("data.resolution=13 .*r_3.png.* at most 8", resolution=13)
     # A video needs frames of equal size.
     read = partial(load_images, [scene.image(0), scene.image(3)], None)
     refused(read, "r_3.png has 8x6", "r_0.png has 12x12")
@@ -361,6 +362,14 @@ def test_a_lens_that_folds_inside_its_images(scene):
 
 
 # Masks
+
+
+def test_images_without_a_mask_among_others_are_told_of(scene):
+    save(scene.path / "mask.png", np.tri(12, dtype=np.uint8) * 255)
+    for index in range(4):
+        scene.change(index, mask_path="mask.png")
+    with told(r"no mask of 1 of 5 images, which are shown whole: train/r_4\.png"):
+        scene.read(mask_use="ignore")
 
 
 def test_masks_become_alpha(scene):
@@ -496,6 +505,11 @@ def test_the_same_view_twice_or_a_mask_of_another_size(scene):
         scene.change(3, **(third | changes))
         scene.refused(f"frame 3.*{words}.*frame 1")
     scene.change(3, **third)
+    whole = json.dumps(scene.contents)
+    scene.change(3, transform_matrix=first["transform_matrix"])
+    scene.change_each(time=0.0)  # A turntable may end where it began.
+    assert len(scene.train()) == 5
+    scene.contents = json.loads(whole)
     save(scene.path / "low.png", np.full((9, 12), 255, np.uint8))
     scene.change(1, mask_path="low.png")
     scene.refused("12x9 pixels.*r_1.png, whose mask it is, has 12x12")

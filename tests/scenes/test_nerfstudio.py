@@ -183,6 +183,11 @@ def test_times_in_any_unit_are_mapped_over_all_frames(capture, key, caplog):
         assert views.times.tolist() == pytest.approx(expected, abs=1e-6)
 
 
+def test_the_source_of_times_tells_clocks_apart(capture):
+    capture.timed([1_700_000_000.25 + 0.125 * i for i in range(10)])
+    assert "from 1700000000.25 to 1700000001.375: " in capture.read().notes["times"]
+
+
 def test_times_from_0_to_1_stay(capture, caplog):
     capture.timed([0.1 + i / 20 for i in range(10)])
     with caplog.at_level(logging.INFO, logger="xplanes"):
@@ -382,10 +387,10 @@ def test_alpha_beside_images_is_read(capture, name):
 
 
 def test_a_missing_mask_is_not_the_image_itself(capture):
-    capture.put("masks/{}.png", band())
+    capture.put("{}.png", band())
     for index in range(10):
-        capture.change(index, mask_path=f"masks/frame_{index:05d}.png")
-    (capture.path / "masks/frame_00003.png").unlink()
+        capture.change(index, mask_path=f"frame_{index:05d}.png")
+    (capture.path / "frame_00003.png").unlink()
     with told("1 of 10 frames are left out:(.|\n)*frame 3.*no mask of"):
         assert len(capture.all()) == 9
 
@@ -606,9 +611,10 @@ def test_lenses_of_unknown_names_are_told_of(capture, name):
         lambda pose: {"transform_matrix": pose[:3].tolist()},
         lambda pose: {"transform_matrix": pose.ravel().tolist()},
         lambda pose: {"transform_matrix": (pose * [0.3, 0.3, 0.3, 1]).tolist()},
+        lambda pose: {"transform_matrix": (pose * [1.0008, 1.0008, 1.0008, 1]).tolist()},
         lambda pose: {"transform_matrix_start": pose.tolist()},
     ],
-    ids=["three rows", "one list", "scaled", "of a rolling shutter"],
+    ids=["three rows", "one list", "scaled", "scaled a little", "of a rolling shutter"],
 )
 def test_poses_as_programs_write_them(capture, write):
     expected = capture.train().camera_to_world

@@ -214,7 +214,7 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
 
 
 def mask_files(folder: Path, names: Sequence[Sequence[str]]) -> tuple[Path | None, ...]:
-    """The mask of each image; None, with a warning, for images without a mask.
+    """The mask of each image; None for images without a mask.
 
     Args:
         folder: Folder of masks.
@@ -225,16 +225,10 @@ def mask_files(folder: Path, names: Sequence[Sequence[str]]) -> tuple[Path | Non
     """
     root = _like(folder)
     masks = tuple(None if root is None else _mask(root, each) for each in names)
-    bare = [f"{each[0]}.png" for each, mask in zip(names, masks, strict=True) if mask is None]
-    if len(bare) == len(masks):
+    if not any(masks):
         raise SceneError(
             f"data.masks: {folder} {'holds' if root else 'does not exist, so there is'} no mask of "
-            f"any image, such as {bare[0]}. Put the masks there, or set data.masks=null."
-        )
-    if bare:
-        warn(
-            f"{folder} has no mask of {len(bare)} of {len(masks)} images, which are shown whole: "
-            f"{some(bare)}."
+            f"any image, such as {names[0][0]}.png. Put the masks there, or set data.masks=null."
         )
     return masks
 
@@ -356,8 +350,7 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
         )
     rotation = pose[:3, :3]
     # A uniform scale of the camera does not change its rays.
-    scale = np.cbrt(abs(np.linalg.det(rotation)))
-    if scale > 0 and abs(scale - 1) > RIGID_TOLERANCE:
+    if (scale := np.cbrt(abs(np.linalg.det(rotation)))) > 0:
         rotation /= scale
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > RIGID_TOLERANCE:
@@ -487,7 +480,7 @@ def refuse_repeats(
         labels: The file and frame of each image, for messages. [V]
         paths: Image files. [V]
         poses: Their cameras. [V, 4, 4]
-        times: Their times; empty for a static scene, whose cameras may repeat. [V]
+        times: Their times; equal or empty for a static scene, whose cameras may repeat. [V]
 
     Raises:
         SceneError: If a file, or a pair of camera and time, occurs twice.
@@ -499,7 +492,7 @@ def refuse_repeats(
         if other is not label:
             raise SceneError(f"{label} has the same file as {other}. Remove one of the two.")
         # In a static scene, a camera may pass the same place twice.
-        if not times:
+        if len(set(times)) < 2:
             continue
         other = seen.setdefault((poses[index].tobytes(), times[index]), label)
         if other is not label:

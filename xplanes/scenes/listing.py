@@ -144,6 +144,8 @@ class Listing:
     ) -> "Listing":
         """A list of images that has passed the checks common to all formats.
 
+        Warns about images without a mask among others that have one.
+
         Args:
             source: File of the cameras, for messages.
             labels: The file and frame of each image, for messages. [V]
@@ -174,6 +176,14 @@ class Listing:
             **more,
         )
         _require_shapes(listing)
+        bare = [
+            file for file, mask in zip(listing.files, listing.masks, strict=False) if mask is None
+        ]
+        if bare:
+            warn(
+                f"{source}: there is no mask of {len(bare)} of {len(listing)} images, which are "
+                f"shown whole: {some(bare)}."
+            )
         return listing
 
     def turned(self, turn: Tensor) -> "Listing":
@@ -200,9 +210,13 @@ def time_source(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
         files: Names of the images. [V]
         times: Their times as given. [V]
     """
+    low, high = min(times), max(times)
+    # Six digits of what differs, as clocks count from 1970.
+    largest = max(abs(low), abs(high))
+    digits = 6 + int(math.log10(largest / (high - low))) if high > low else 6
     first, last, *known = (
-        f"{time:.6g}" if isinstance(time, float) else str(time)
-        for time in (min(times), max(times), *times)
+        f"{time:.{min(max(digits, 6), 17)}g}" if isinstance(time, float) else str(time)
+        for time in (low, high, *times)
     )
     shown = dict.fromkeys(spread(min(len(files), 3), len(files)))
     examples = ", ".join(f"{files[rank]} -> {known[rank]}" for rank in shown)

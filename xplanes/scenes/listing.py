@@ -213,9 +213,9 @@ def time_source(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
     low, high = min(times), max(times)
     # Six digits of what differs, as clocks count from 1970.
     largest = max(abs(low), abs(high))
-    digits = 6 + int(math.log10(largest / (high - low))) if high > low else 6
+    digits = min(17, 6 + int(math.log10(largest / (high - low)))) if high > low else 6
     first, last, *known = (
-        f"{time:.{min(max(digits, 6), 17)}g}" if isinstance(time, float) else str(time)
+        f"{time:.{digits}g}" if isinstance(time, float) else str(time)
         for time in (low, high, *times)
     )
     shown = dict.fromkeys(spread(min(len(files), 3), len(files)))

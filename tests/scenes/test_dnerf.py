@@ -16,6 +16,7 @@ from tests.captures import save, settings
 from tests.scenes.common import ANGLE, SceneFolder, pose, refused, rgba, told
 from xplanes.components import build
 from xplanes.config import compose_plain
+from xplanes.errors import MissingSplitError
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.scenes.images import load_images, load_premultiplied
@@ -278,6 +279,7 @@ def test_resolutions_that_images_do_not_have(scene):
     save(scene.image(3), rgba(0, 8)[:6])
     assert scene.train(resolution=4).size(3) == (3, 4)
     scene.refused("data.resolution=9 is more than the 8 pixels", "r_3.png", resolution=9)
+    scene.refused("data.resolution=13 .*r_3.png.* at most 8", resolution=13)
     # A video needs frames of equal size.
     read = partial(load_images, [scene.image(0), scene.image(3)], None)
     refused(read, "r_3.png has 8x6", "r_0.png has 12x12")
@@ -296,6 +298,18 @@ def test_other_names_of_an_image_find_it(scene, name):
     views = scene.train()
     assert views.files == expected.files
     assert torch.equal(views.image(1), expected.image(1))
+
+
+def test_images_of_another_split_are_not_found_for_those_that_are_missing(scene):
+    scene.add("test", 2)
+    (scene.path / "train").rename(scene.path / "images")
+    shutil.rmtree(scene.path / "test")
+    scene.change_each(file_path=lambda name: name.replace("train/", "images/"))
+    with told(r"test split is left out.*test/r_0\): no image"):
+        scene.refused("no image", splits=["train", "test"], error=MissingSplitError)
+    scene.change_each("test", file_path=lambda name: f"C:\\ball\\{name}".replace("test", "images"))
+    with told(r"2 of 2 images of the test split, such as C:/ball/images/r_0, are found only as"):
+        scene.read(["train", "test"])
 
 
 def test_links_are_followed(scene):
@@ -350,6 +364,14 @@ def test_a_lens_that_folds_inside_its_images(scene):
 # Masks
 
 
+def test_images_without_a_mask_among_others_are_told_of(scene):
+    save(scene.path / "mask.png", np.tri(12, dtype=np.uint8) * 255)
+    for index in range(4):
+        scene.change(index, mask_path="mask.png")
+    with told(r"no mask of 1 of 5 images, which are shown whole: train/r_4\.png"):
+        scene.read(mask_use="ignore")
+
+
 def test_masks_become_alpha(scene):
     grey = np.zeros((12, 12), np.uint8)
     grey[:, 3:] = 255
@@ -375,6 +397,36 @@ def test_masks_become_alpha(scene):
     expected = expected.reshape(4, 3, 4, 3, 4).mean(axis=(1, 3))
     found = scene.train(resolution=4, mask_use="alpha").image(1).numpy()
     assert np.abs(found - expected).max() <= 0.5 + 1e-3
+
+
+def test_masks_mean_the_same_whichever_parts_are_read(scene):
+    """A file that is the mask of several images is no silhouette, not even that of a lone one."""
+    scene.add("test", 1)
+    bars = np.zeros((12, 12), np.uint8)
+    bars[4:8] = 255
+    save(scene.path / "mask.png", bars)
+    for split in ("train", "test"):
+        scene.change(split=split, mask_path="mask.png")
+    for splits in (["train", "test"], ["test"], ["train"]):
+        shown = scene.read(splits, views=1).splits[splits[-1]].shown(0)
+        assert torch.equal(shown, torch.from_numpy(bars > 0)), splits
+    scene.change(split="test", mask_path=...)
+    assert scene.read(["test"], mask_use="lrm").splits["test"].ignored is None
+    scene.change(mask_path=...)
+    scene.refused("no training image has a mask file", mask_use="lrm")
+
+
+def test_masks_of_the_video_mean_what_those_of_other_images_do(scene):
+    scene.add("video", 3, fixed=True)
+    bars = np.zeros((12, 12), np.uint8)
+    bars[4:8] = 255
+    for split in ("train", "video"):
+        for index in range(len(scene.frames(split))):
+            save(scene.path / split / f"dynamic_mask_r_{index}.png", bars)
+    found = scene.read()
+    for views in (found.splits["train"], found.video):
+        assert torch.equal(views.shown(0), torch.from_numpy(bars == 0))
+        assert views.image(0)[bars == 0][:, 3].any()
 
 
 MATRIX = np.array(pose(1))
@@ -453,6 +505,11 @@ def test_the_same_view_twice_or_a_mask_of_another_size(scene):
         scene.change(3, **(third | changes))
         scene.refused(f"frame 3.*{words}.*frame 1")
     scene.change(3, **third)
+    whole = json.dumps(scene.contents)
+    scene.change(3, transform_matrix=first["transform_matrix"])
+    scene.change_each(time=0.0)  # A turntable may end where it began.
+    assert len(scene.train()) == 5
+    scene.contents = json.loads(whole)
     save(scene.path / "low.png", np.full((9, 12), 255, np.uint8))
     scene.change(1, mask_path="low.png")
     scene.refused("12x9 pixels.*r_1.png, whose mask it is, has 12x12")

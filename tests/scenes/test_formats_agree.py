@@ -192,4 +192,4 @@ def test_masks_for_lrms_leave_the_images_whole(name, tmp_path):
 
 def test_masks_that_are_not_there_are_not_for_lrms(tmp_path):
     made = replace(colmap(tmp_path, text=False), mask_use="lrm", masks=None)
-    refused(made.read, r"data\.mask_use=lrm: no image has a mask file.*auto")
+    refused(made.read, r"data\.mask_use=lrm: no training image has a mask file.*auto")

@@ -213,6 +213,14 @@ def test_folders_of_cameras_may_have_other_names_and_levels(videos, tmp_path, ou
     require_all(read(tmp_path, test_cameras=[name.format(0)]))
 
 
+def test_folders_of_single_views_are_no_cameras(tmp_path):
+    for view, what in ((view, what) for view in range(CAMERAS) for what in ("rgb", "depth_0")):
+        save(tmp_path / f"{view:04d}" / f"{what}.png", rgb(view)[0])
+    for name in ("{:04d}/rgb.png", "{:04d}/depth_0"):
+        with_transforms(tmp_path, name)
+        assert NerfstudioSettings.recognises(tmp_path)
+
+
 def test_transforms_may_name_videos(videos, copied):
     (copied / "poses_bounds.npy").unlink()
     with_transforms(copied, "cam{:02d}.mp4")

@@ -39,6 +39,10 @@ from xplanes.scenes.name_times import times_in_names
         ("clip_1_1080p clip_2_1080p clip_5_1080p", [0, 0.25, 1]),
         ("12345678_200001 12345678_200002 12345678_200005", [0, 0.25, 1]),
         ("cam1 cam2 cam5", [0, 0.25, 1]),
+        ("20260102_115959 20260102_115959(1) 20260102_115959(4)", [0, 0.25, 1]),
+        ("f_000 f_001 f_001(7) f_004", [0, 0.25, 0.25, 1]),
+        ("IMG_20260102_115959_500 IMG_20260102_120000_000 IMG_20260102_120001_500", [0, 0.25, 1]),
+        ("0000/cam0 0000/cam1 0001/cam0 0001/cam1 0004/cam0", [0, 0, 0.25, 0.25, 1]),
     ],
 )
 def test_names_tell_times(names, times):
@@ -54,6 +58,8 @@ def test_names_tell_times(names, times):
         (["00_58.png", "00_59.png", "01_00.png", "01_01.png", "01_02.png"], r"01_00\.png -> 0\)"),
         ([f"a_{i // 4}_{'xy'[i % 2]}{'pq'[i % 4 // 2]}.png" for i in range(16)], "only 4, for 16"),
         ([f"{i:06d}/{j:02d}.png" for i in range(4) for j in range(2)], "taken for cameras"),
+        ([f"frame{i:05d}/{j:02d}.png" for i in range(4) for j in range(2)], "taken for cameras"),
+        ([f"{i:03d}/{j:02d}.png" for i in range(4) for j in range(3)], "taken for cameras"),
         (["t_-2.png", "t_1.png", "t_2.png"], "-2"),
     ],
 )

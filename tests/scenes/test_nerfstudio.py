@@ -148,6 +148,7 @@ def test_lists_of_file_names_are_the_splits(capture):
         ({"val_filenames": "a"}, "val_filenames is 'a', not a list"),
         ({"val_filenames": ["../x.png"]}, "val_filenames leaves the scene's folder"),
         ({"val_filenames": ..., "train_filenames": []}, "no frames to train on"),
+        ({"test_filenames": []}, "no frames to train on: fill"),
     ):
         capture.change(**changes)
         capture.refused(words)
@@ -180,6 +181,11 @@ def test_times_in_any_unit_are_mapped_over_all_frames(capture, key, caplog):
     for views in parts.values():
         expected = [number / 9 for number in numbers(views)]
         assert views.times.tolist() == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_source_of_times_tells_clocks_apart(capture):
+    capture.timed([1_700_000_000.25 + 0.125 * i for i in range(10)])
+    assert "from 1700000000.25 to 1700000001.375: " in capture.read().notes["times"]
 
 
 def test_times_from_0_to_1_stay(capture, caplog):
@@ -381,10 +387,10 @@ def test_alpha_beside_images_is_read(capture, name):
 
 
 def test_a_missing_mask_is_not_the_image_itself(capture):
-    capture.put("masks/{}.png", band())
+    capture.put("{}.png", band())
     for index in range(10):
-        capture.change(index, mask_path=f"masks/frame_{index:05d}.png")
-    (capture.path / "masks/frame_00003.png").unlink()
+        capture.change(index, mask_path=f"frame_{index:05d}.png")
+    (capture.path / "frame_00003.png").unlink()
     with told("1 of 10 frames are left out:(.|\n)*frame 3.*no mask of"):
         assert len(capture.all()) == 9
 
@@ -605,9 +611,10 @@ def test_lenses_of_unknown_names_are_told_of(capture, name):
         lambda pose: {"transform_matrix": pose[:3].tolist()},
         lambda pose: {"transform_matrix": pose.ravel().tolist()},
         lambda pose: {"transform_matrix": (pose * [0.3, 0.3, 0.3, 1]).tolist()},
+        lambda pose: {"transform_matrix": (pose * [1.0008, 1.0008, 1.0008, 1]).tolist()},
         lambda pose: {"transform_matrix_start": pose.tolist()},
     ],
-    ids=["three rows", "one list", "scaled", "of a rolling shutter"],
+    ids=["three rows", "one list", "scaled", "scaled a little", "of a rolling shutter"],
 )
 def test_poses_as_programs_write_them(capture, write):
     expected = capture.train().camera_to_world
@@ -668,6 +675,17 @@ def test_smaller_copies_stand_in_for_images_that_are_missing(capture):
         found = capture.train(resolution=12)
     assert found.files[0].startswith("images_4/")
     assert_same_rays(found, 1, whole, 1)
+    names = [frame["file_path"] for frame in capture.frames()]
+    capture.change(train_filenames=[f"./{name}" for name in names[:6]], val_filenames=names[6:])
+    with told("10 of 10 images are missing and read from smaller"):
+        parts = capture.read(("train", "val")).splits.values()
+    assert [numbers(views) for views in parts] == [[0, 1, 2, 3, 4, 5], [6, 7, 8, 9]]
+    capture.put("masks/{}.png", np.full((2 * SIZE, 2 * SIZE), 255, np.uint8))
+    capture.put("masks_4/{}.png", disc())
+    for index, name in enumerate(names):
+        capture.change(index, mask_path=name.replace("images", "masks"))
+    with told("read from smaller|Both readings"):
+        assert_shown(capture.train(mask_use="ignore"), disc())
     capture.change(w=..., h=...)
     capture.refused("no image .*images/frame_00000", error=MissingSplitError)
 

@@ -6,14 +6,15 @@ from pathlib import Path
 from typing import ClassVar
 
 from xplanes.errors import MissingSplitError, SceneError, warn
-from xplanes.scenes.listing import Listing, read_views
+from xplanes.scenes.entries import spelt
+from xplanes.scenes.listing import Listing
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.source import SceneSettings, warn_of_masks
-from xplanes.scenes.transforms import listing_of, read_frames, time_span
+from xplanes.scenes.transforms import all_masks, listing_of, read_frames, readable, time_span
 from xplanes.scenes.views import Scene
 
 PARTS = ("train", "val", "test", "video")
-"""Parts that share a unit of time: splits, and the video of a fixed camera."""
+"""Parts that share a unit of time, and the meaning of masks: splits, and a fixed camera's video."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,15 +61,15 @@ def read_scene(settings: SceneSettings, splits: Sequence[str], mask_use: MaskUse
     if not any(folder.glob("transforms_*.json")):
         raise settings.no_scene()
     paths = {split: _transforms_path(folder, split) for split in dict.fromkeys(splits)}
-    span = time_span([folder / f"transforms_{part}.json" for part in PARTS])
+    contents = readable([folder / f"transforms_{part}.json" for part in PARTS])
+    span = time_span(contents.values())
     listed = {split: _listed(split, path, span) for split, path in paths.items()}
+    _warn_of_shared_files(folder, listed)
     listed = settings.thinned(listed)
     video = _list_video(folder, span)
     _require_times(folder, listed, video)
-    frames = None
-    if video is not None:
-        frames = read_views(video, settings.resolution, settings.image_cache)
-    return settings.scene_of(listed, mask_use, video=frames)
+    # Masks mean the same whichever parts are read.
+    return settings.scene_of(listed, mask_use, all_masks(contents), video=video)
 
 
 def _listed(split: str, path: Path, span: tuple[float, float] | None) -> Listing:
@@ -81,6 +82,20 @@ def _listed(split: str, path: Path, span: tuple[float, float] | None) -> Listing
             more = " No other frame of it can be used either." if others else ""
             warn(f"The {split} split is left out. {first}{more}")
         raise
+
+
+def _warn_of_shared_files(folder: Path, parts: Mapping[str, Listing]) -> None:
+    """Warn if scored splits show files of training images, found under other names."""
+    if (train := parts.get("train")) is None:
+        return
+    names = {image: spelt(name) for image, name in zip(train.paths, train.names, strict=True)}
+    for split, part in parts.items():
+        pairs = zip(part.paths, map(spelt, part.names), strict=True)
+        if shared := [name for image, name in pairs if names.get(image, name) != name]:
+            warn(
+                f"{folder}: {len(shared)} of {len(part)} images of the {split} split, such as "
+                f"{shared[0]}, are found only as files of training images. Add those of the split."
+            )
 
 
 def _require_times(folder: Path, parts: Mapping[str, Listing], video: Listing | None) -> None:

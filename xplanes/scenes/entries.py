@@ -55,8 +55,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
 
     The suffix may be missing or that of another format, and the name may differ in case or in the
     encoding of accents, as long as only one file matches; it may be percent-encoded. If a path does
-    not exist, such as one of another machine, its first folders are dropped. A name without folders
-    is also tried in images.
+    not exist, such as one of another machine, its first folders are dropped; a relative name keeps
+    its last folder. A name without folders is also tried in images.
 
     Args:
         label: The file and frame that name it, for messages.
@@ -73,7 +73,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         if image.is_file():
             return _with_content(label, image)
         choices.append(image)
-    inside = [folder / "images" / path.name for path in choices if path.parent == folder]
+    bare = "/" not in spelt(name)
+    inside = [folder / "images" / path.name for path in choices if bare]
     for image in inside:
         if image.is_file():
             return _with_content(label, image)
@@ -86,8 +87,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         same = [path for path in found if _normalised(path.name) == _normalised(image.name)]
         if len(chosen := same or found) == 1:
             return _with_content(label, chosen[0])
-    if (spelt := unquote(name)) != name:  # Percent-encoded, as in URLs.
-        return image_path(label, folder, spelt, key)
+    if (plain := unquote(name)) != name:  # Percent-encoded, as in URLs.
+        return image_path(label, folder, plain, key)
     if Path(name).is_absolute() and Path(name).is_file():
         raise BrokenFrameError(
             f"{label}: {key} leaves the scene's folder {folder}. Put a link to {Path(name).parent} "
@@ -169,6 +170,11 @@ def _like(folder: Path) -> Path | None:
     return names[0] if len(names) == 1 and names[0].is_dir() else None
 
 
+def spelt(name: Any) -> str:
+    """A name in one spelling: with slashes, and without . and .. where they change nothing."""
+    return os.path.normpath(str(name).replace("\\", "/"))
+
+
 def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) -> Iterator[Path]:
     """Paths that a name may refer to inside ``folder``, unchanged and with image suffixes.
 
@@ -187,7 +193,7 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
     if not isinstance(name, str) or not name or "\0" in name:
         raise SceneError(f"{label}: {key} is {short(name)}; it must be text such as {example}.")
     # Blender on Windows writes backslashes.
-    whole = Path(os.path.normpath(folder / name.replace("\\", "/")))
+    whole = Path(os.path.normpath(folder / spelt(name)))
     parts = whole.parts
     if whole.is_relative_to(folder):
         parts = whole.relative_to(folder).parts
@@ -196,8 +202,10 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
             f"{label}: {key} leaves the scene's folder {folder} (it is {name}). Put its files "
             f"inside the folder and correct {key}."
         )
-    # If the path does not exist, its first folders are dropped one by one.
-    for first in range(max(1, len(parts))):
+    # If the path does not exist, its first folders are dropped one by one. The last one of a
+    # relative name tells apart files such as train/0001.png and test/0001.png.
+    least = 1 if PureWindowsPath(name).anchor else 2
+    for first in range(max(1, len(parts) - least + 1)):
         relative = Path(*parts[first:])
         if relative.is_absolute() or (first and not (folder / relative).parent.is_dir()):
             continue
@@ -206,7 +214,7 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
 
 
 def mask_files(folder: Path, names: Sequence[Sequence[str]]) -> tuple[Path | None, ...]:
-    """The mask of each image; None, with a warning, for images without a mask.
+    """The mask of each image; None for images without a mask.
 
     Args:
         folder: Folder of masks.
@@ -217,16 +225,10 @@ def mask_files(folder: Path, names: Sequence[Sequence[str]]) -> tuple[Path | Non
     """
     root = _like(folder)
     masks = tuple(None if root is None else _mask(root, each) for each in names)
-    bare = [f"{each[0]}.png" for each, mask in zip(names, masks, strict=True) if mask is None]
-    if len(bare) == len(masks):
+    if not any(masks):
         raise SceneError(
             f"data.masks: {folder} {'holds' if root else 'does not exist, so there is'} no mask of "
-            f"any image, such as {bare[0]}. Put the masks there, or set data.masks=null."
-        )
-    if bare:
-        warn(
-            f"{folder} has no mask of {len(bare)} of {len(masks)} images, which are shown whole: "
-            f"{some(bare)}."
+            f"any image, such as {names[0][0]}.png. Put the masks there, or set data.masks=null."
         )
     return masks
 
@@ -348,8 +350,7 @@ def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.n
         )
     rotation = pose[:3, :3]
     # A uniform scale of the camera does not change its rays.
-    scale = np.cbrt(abs(np.linalg.det(rotation)))
-    if scale > 0 and abs(scale - 1) > RIGID_TOLERANCE:
+    if (scale := np.cbrt(abs(np.linalg.det(rotation)))) > 0:
         rotation /= scale
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > RIGID_TOLERANCE:
@@ -479,7 +480,7 @@ def refuse_repeats(
         labels: The file and frame of each image, for messages. [V]
         paths: Image files. [V]
         poses: Their cameras. [V, 4, 4]
-        times: Their times; empty for a static scene, whose cameras may repeat. [V]
+        times: Their times; equal or empty for a static scene, whose cameras may repeat. [V]
 
     Raises:
         SceneError: If a file, or a pair of camera and time, occurs twice.
@@ -491,7 +492,7 @@ def refuse_repeats(
         if other is not label:
             raise SceneError(f"{label} has the same file as {other}. Remove one of the two.")
         # In a static scene, a camera may pass the same place twice.
-        if not times:
+        if len(set(times)) < 2:
             continue
         other = seen.setdefault((poses[index].tobytes(), times[index]), label)
         if other is not label:

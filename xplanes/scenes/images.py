@@ -89,13 +89,13 @@ def final_sizes(
     """
     if resolution is None:
         return list(native)
-    for path, (_, width) in zip(paths, native, strict=True):
-        if resolution > width:
-            raise SceneError(
-                f"data.resolution={resolution} is more than the {width} pixels that {path} is "
-                f"wide. Enlarged images have no more detail: set at most {width}, or null for the "
-                "native size."
-            )
+    width, path = min((size[1], path) for path, size in zip(paths, native, strict=True))
+    if resolution > width:
+        raise SceneError(
+            f"data.resolution={resolution} is more than the {width} pixels that {path} is wide. "
+            f"Enlarged images have no more detail: set at most {width}, or null for the native "
+            "size."
+        )
     return [(max(1, round(height * resolution / width)), resolution) for height, width in native]
 
 

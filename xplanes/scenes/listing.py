@@ -111,6 +111,7 @@ class Listing:
             pixels are to be ignored); empty if it does not define it.
         clear: Grey levels, out of 255, that are transparent in its images.
         time_source: Source of the times, with examples; empty if there are no times.
+        names: Their names in the file of the cameras; empty if nothing else refers to them. [V]
         origin: Origin of the poses in the files' world.
     """
 
@@ -124,6 +125,7 @@ class Listing:
     mask_meaning: str = ""
     clear: tuple[int, ...] = ()
     time_source: str = ""
+    names: tuple[str, ...] = ()
     origin: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __len__(self) -> int:
@@ -141,6 +143,8 @@ class Listing:
         **more: Any,
     ) -> "Listing":
         """A list of images that has passed the checks common to all formats.
+
+        Warns about images without a mask among others that have one.
 
         Args:
             source: File of the cameras, for messages.
@@ -172,6 +176,14 @@ class Listing:
             **more,
         )
         _require_shapes(listing)
+        bare = [
+            file for file, mask in zip(listing.files, listing.masks, strict=False) if mask is None
+        ]
+        if bare:
+            warn(
+                f"{source}: there is no mask of {len(bare)} of {len(listing)} images, which are "
+                f"shown whole: {some(bare)}."
+            )
         return listing
 
     def turned(self, turn: Tensor) -> "Listing":
@@ -183,7 +195,8 @@ class Listing:
     def subset(self, indices: Sequence[int]) -> "Listing":
         """The images at ``indices``, in that order. [K]"""
         chosen = list(indices)
-        each = {name: getattr(self, name) for name in ("paths", "files", "calibrations", "masks")}
+        lists = ("paths", "files", "names", "calibrations", "masks")
+        each = {name: getattr(self, name) for name in lists}
         kept = {name: tuple(part[i] for i in chosen) for name, part in each.items() if part}
         poses, times = self.camera_to_world[chosen], self.times[chosen]
         return replace(self, camera_to_world=poses, times=times, **kept)
@@ -197,9 +210,13 @@ def time_source(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
         files: Names of the images. [V]
         times: Their times as given. [V]
     """
+    low, high = min(times), max(times)
+    # Six digits of what differs, as clocks count from 1970.
+    largest = max(abs(low), abs(high))
+    digits = min(17, 6 + int(math.log10(largest / (high - low)))) if high > low else 6
     first, last, *known = (
-        f"{time:.6g}" if isinstance(time, float) else str(time)
-        for time in (min(times), max(times), *times)
+        f"{time:.{digits}g}" if isinstance(time, float) else str(time)
+        for time in (low, high, *times)
     )
     shown = dict.fromkeys(spread(min(len(files), 3), len(files)))
     examples = ", ".join(f"{files[rank]} -> {known[rank]}" for rank in shown)

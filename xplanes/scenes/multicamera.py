@@ -10,7 +10,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, ClassVar
 
 import numpy as np
@@ -279,13 +279,22 @@ def _recordings(folder: Path, *others: str) -> list[Path]:
 def is_rig(folder: Path) -> bool:
     """Whether the frames of transforms.json name different videos or folders of several images.
 
-    If so, they are cameras rather than the images of a capture.
+    If so, they are cameras rather than the images of a capture. A folder whose named image is the
+    only one of its kind, such as rgb.png beside depth.png, is a view of a capture.
     """
+
+    def kind(name: str) -> str:
+        return re.sub(r"\d+", "#", PureWindowsPath(name).stem)
+
     sources: set[Path] = set()
     try:
         for frame in read_frames(folder / TRANSFORMS)["frames"]:
             source = _source("", folder.resolve(), frame["file_path"])
-            if source in sources or (source.is_dir() and len(_images_in(source)) < 2):
+            if source.is_dir():
+                kinds = [kind(path.name) for path in _images_in(source)]
+                if len(kinds) < 2 or kinds.count(kind(frame["file_path"])) == 1:
+                    return False
+            if source in sources:
                 return False
             sources.add(source)
     except SceneError:

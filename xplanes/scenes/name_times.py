@@ -1,7 +1,7 @@
 """Times of images from the numbers in their names."""
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -30,9 +30,9 @@ CLOCK = re.compile(r"(?<![A-Za-z\d])\d+\.\d+(?=s?$)|(?<!\d)(\d{10})[_-](\d{9}|\d
 
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_.T ]*(?:at )?"
-    r"(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)[s.]?(\d*)"
+    r"(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)(?:[_-](?=\d{3}(?!\d))|[s.]?)(\d*)"
 )
-"""Date and time of day, with parts of a second, as in PXL_20260102_115959250."""
+"""Date and time of day, with parts of a second, as in PXL_20260102_115959250 and IMG_..._250."""
 
 NUMBER = r"(?:(?:(?<=[_ ])|^)-)?\d+"
 """A whole number; a sign belongs to it at the beginning, or after a separator."""
@@ -58,15 +58,15 @@ def times_in_names(names: Sequence[str]) -> list[Number]:
             return _checked(names, found)
     # If each folder is a timestep, file names are those of cameras.
     paths = [PurePosixPath(name).with_suffix("").as_posix() for name in names]
-    bare = [[CAMERA.sub("", text) for text in texts] for texts in (stems, paths)]
-    for texts in (*bare, stems):
+    files, whole = ([CAMERA.sub("", text) for text in texts] for texts in (stems, paths))
+    for texts in (files, whole, stems):
         found = _most_different(texts)
         if len(set(found)) > 1 or (found and len(names) == 1):
             break
     if why := _no_series(names, stems, found):
         warn(f"{why}: all images are taken for one timestep. {OTHER_TIMES}")
         return []
-    return _checked(names, found)
+    return _checked(names, found, by_file=texts is not whole)
 
 
 def _date(stem: str) -> float | None:
@@ -91,15 +91,16 @@ def _clock(stem: str) -> float | None:
 def _most_different(texts: Sequence[str]) -> list[Number]:
     """The number in each name at the position where numbers vary most, or the last such position.
 
-    If names have different counts of numbers, their last ones; empty if a name has none.
+    If no position that all names have varies, the last number of those that have more, such as 3 in
+    clip_1(3), and 0 for the others. Empty if a name has none.
     """
     rows = [re.findall(NUMBER, text) for text in texts]
     if not all(rows):
         return []
     least = min(map(len, rows))
-    if least < max(map(len, rows)):
-        return [int(row[-1]) for row in rows]
     place = max(range(least), key=lambda column: (len({row[column] for row in rows}), column))
+    if len({row[place] for row in rows}) == 1 and max(map(len, rows)) > least:
+        return [int(row[-1]) if len(row) > least else 0 for row in rows]
     return [int(row[place]) for row in rows]
 
 
@@ -120,9 +121,11 @@ def _no_series(names: Sequence[str], stems: Sequence[str], found: Sequence[Numbe
 def _folders(names: Sequence[str]) -> list[list[int]]:
     """Indices of the images of each folder and camera, in the order of their names."""
     folders: dict[tuple[str, ...], list[int]] = defaultdict(list)
-    for place in sorted(range(len(names)), key=lambda i: natural(CAMERA.sub("", names[i]))):
-        path = PurePosixPath(names[place])
-        cameras = (match[0] for match in CAMERA.finditer(path.stem))
+    paths = [PurePosixPath(name).with_suffix("") for name in names]
+    bare = [natural(CAMERA.sub("", path.as_posix())) for path in paths]
+    for place in sorted(range(len(names)), key=bare.__getitem__):
+        path = paths[place]
+        cameras = (match[0] for match in CAMERA.finditer(path.name))
         folders[path.parent.as_posix(), *cameras].append(place)
     return list(folders.values())
 
@@ -132,8 +135,14 @@ def _few(names: Sequence[str], times: Sequence[Number]) -> bool:
     return len(set(times)) < FEW * max(map(len, _folders(names)))
 
 
-def _checked(names: Sequence[str], times: list[Number]) -> list[Number]:
-    """The times; warns if they are implausible."""
+def _checked(names: Sequence[str], times: list[Number], by_file: bool = False) -> list[Number]:
+    """The times; warns if they are implausible.
+
+    Args:
+        names: Names of the images. [V]
+        times: Their times. [V]
+        by_file: Whether the times are numbers in the files' names, even if folders are timesteps.
+    """
     why, shown = "", list(range(min(3, len(names))))
     for places in _folders(names):
         back = [pair for pair in pairwise(places) if times[pair[1]] < times[pair[0]]]
@@ -142,9 +151,12 @@ def _checked(names: Sequence[str], times: list[Number]) -> list[Number]:
             break
     if not why and _few(names, times):
         why = f"are only {len(set(times))}, for {len(names)} images"
-    folders = sorted({PurePosixPath(name).parent.name for name in names})
-    if not why and len(folders) > 1 and all(re.fullmatch(r"\d{4,}", name) for name in folders):
-        why = f"are those of the files, and the folders {some(folders)} are taken for cameras"
+    folders = Counter(PurePosixPath(name).parent.name for name in names)
+    alike = len({re.sub(r"\d+", "#", folder) for folder in folders}) == 1
+    timesteps = alike and len(folders) > max(folders.values())
+    if not why and by_file and timesteps and not any(map(CAMERA.search, folders)):
+        found = some(sorted(folders))
+        why = f"are those of the files, and the folders {found} are taken for cameras"
     if why:
         pairs = ", ".join(f"{names[place]} -> {times[place]}" for place in shown)
         warn(f"The times from the numbers in the names {why} ({pairs}). {OTHER_TIMES}")

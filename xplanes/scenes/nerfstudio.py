@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, ClassVar
 
 from xplanes.errors import BrokenFrameError, SceneError, first_of, warn
-from xplanes.scenes.entries import image_path, short
+from xplanes.scenes.entries import image_path, short, spelt
 from xplanes.scenes.listing import Listing, held_out
 from xplanes.scenes.multicamera import is_rig
 from xplanes.scenes.source import CaptureSettings
@@ -40,7 +40,9 @@ class NerfstudioSettings(CaptureSettings):
             raise self.no_scene()
         content = read_frames(path)
         listing = listing_of(path, content)
-        places = _listed_splits(path, content, listing) or held_out(listing, self.eval_every)
+        places = _listed_splits(path, content, listing)
+        if places is None:
+            places = held_out(listing, self.eval_every)
         if "train" in splits and not places.get("train"):
             raise SceneError(f'{path} has no frames to train on: fill "train_filenames".')
         orient, up = stated_up(content, self.orient)
@@ -54,9 +56,13 @@ def _listed_splits(
     listed = {split: content.get(f"{split}_filenames") for split in SPLITS}
     if all(names is None for names in listed.values()):
         return None
-    places = {image: index for index, image in enumerate(listing.paths)}
+    # Frames by name, None for those that are left out, and by file for names spelt differently.
+    places: dict[str | Path, int | None] = dict.fromkeys(
+        spelt(frame["file_path"]) for frame in content["frames"]
+    )
+    for index, (name, image) in enumerate(zip(listing.names, listing.paths, strict=True)):
+        places[spelt(name)] = places[image] = index
     found: dict[str, list[int]] = {}
-    files = {PurePosixPath(frame["file_path"]) for frame in content["frames"]}
     missing = []
     for split, names in listed.items():
         key = f"{split}_filenames"
@@ -66,15 +72,16 @@ def _listed_splits(
             raise SceneError(f"{path}: {key} is {short(names)}, not a list of file names.")
         for name in names:
             try:
-                image = image_path(str(path), path.parent.resolve(), name, key)
+                if (frame := spelt(name)) not in places:
+                    frame = image_path(str(path), path.parent.resolve(), name, key)
+                index = places[frame]
             except BrokenFrameError as problem:
-                if PurePosixPath(name) not in files:  # Missing frames are reported already.
-                    missing.append(f"{key}: {problem}")
-                continue
-            if image in places:
-                found.setdefault(split, []).append(places[image])
-            else:
+                missing.append(f"{key}: {problem}")
+            except KeyError:
                 missing.append(f"{key}: {path}: {name} is in no frame.")
+            else:
+                if index is not None:  # Others are reported already.
+                    found.setdefault(split, []).append(index)
     if missing:
         warn(f"{len(missing)} names in lists of splits are left out:\n{first_of(missing)}")
     splits = {split: sorted(set(chosen)) for split, chosen in found.items()}

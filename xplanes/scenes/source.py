@@ -215,8 +215,9 @@ class SceneSettings(Settings, ABC):
         self,
         parts: Mapping[str, Listing],
         mask_use: MaskUse,
-        whole: Listing | None = None,
+        masks: tuple[Sequence[Path | None], str] | None = None,
         up: str = "",
+        video: Listing | None = None,
         **more: Any,
     ) -> Scene:
         """The scene of listed images, which are decoded here.
@@ -224,27 +225,32 @@ class SceneSettings(Settings, ABC):
         Args:
             parts: The images of each split.
             mask_use: Meaning of the black parts of masks.
-            whole: All images of the capture, from which the meaning of the masks is determined for
-                all splits; those of ``parts`` when None.
+            masks: Masks of the whole capture, from which their meaning is determined for all
+                splits, and what their source says of it, as in `Listing`; those of ``parts`` when
+                None.
             up: Description of the up direction; empty if the files' world is unchanged.
+            video: Frames of a fixed camera, if there are some.
             **more: Further attributes of the scene.
 
         Raises:
-            SceneError: If an image or a mask cannot be used, or with mask_use lrm if there are no
-                masks.
+            SceneError: If an image or a mask cannot be used, or with mask_use lrm if no training
+                image has a mask.
         """
-        listings = [whole] if whole is not None else list(parts.values())
-        masks = [mask for listing in listings for mask in listing.masks]
+        listings = list(parts.values())
+        if masks is None:
+            told = next((listing.mask_meaning for listing in listings if listing.mask_meaning), "")
+            masks = [mask for listing in listings for mask in listing.masks], told
+        files, told = masks
         notes = {"times": source} if (source := listings[0].time_source) else {}
         use, kind, lrm_views = mask_use, GREY, None
-        if any(masks):
-            told = next((listing.mask_meaning for listing in listings if listing.mask_meaning), "")
-            kind = survey(masks, told == "ignored")
-            use, notes["masks"] = chosen_use(mask_use, kind, str(listings[0].paths[0].parent), told)
-        elif mask_use == "lrm":
+        if mask_use == "lrm" and "train" in parts and not any(parts["train"].masks):
             raise SceneError(
-                "data.mask_use=lrm: no image has a mask file. Add masks, or set it to auto."
+                "data.mask_use=lrm: no training image has a mask file. Add masks, or set it to "
+                "auto."
             )
+        if any(files):
+            kind = survey(files, told == "ignored")
+            use, notes["masks"] = chosen_use(mask_use, kind, str(self.folder), told)
 
         def read(part: Listing) -> Views:
             return read_views(part, self.resolution, self.image_cache, use == "ignore", kind)
@@ -253,6 +259,7 @@ class SceneSettings(Settings, ABC):
             lrm_views = read(parts["train"]) if "train" in parts else None
             parts = {split: replace(part, masks=()) for split, part in parts.items()}
         splits = {split: read(part) for split, part in parts.items()}
+        more["video"] = None if video is None else read(video)
         if not up:
             poses = torch.cat([listing.camera_to_world for listing in parts.values()])
             up = world_turn(poses, (), False)[1]
@@ -362,4 +369,5 @@ class CaptureSettings(SceneSettings, ABC):
             found = None if found is None else found @ turn.T
         parts = self.thinned({split: listing.subset(places[split]) for split in splits})
         found = None if found is None else found.float()
-        return self.scene_of(parts, self.mask_use, listing, words, points=found)
+        masks = listing.masks, listing.mask_meaning
+        return self.scene_of(parts, self.mask_use, masks, words, points=found)

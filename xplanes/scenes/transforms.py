@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -22,6 +22,7 @@ from xplanes.scenes.entries import (
     number_in,
     read_object,
     short,
+    spelt,
     unit_times,
     usable,
 )
@@ -113,14 +114,40 @@ SYNONYMS = {"sx1": "s1", "sy1": "s3"}
 """COLMAP's names of a fisheye lens's prism coefficients."""
 
 
-def time_span(paths: Sequence[Path]) -> tuple[float, float] | None:
-    """First and last time in several transforms files; None if no frame has a time."""
-    times = []
+def readable(paths: Sequence[Path]) -> dict[Path, dict[str, Any]]:
+    """Contents of those of several transforms files that `read_frames` can read."""
+    found = {}
     for path in paths:
         with suppress(SceneError):
-            entries = read_frames(path)["frames"]
-            times += [entry[key] for entry in entries if is_number(entry.get(key := _key([entry])))]
+            found[path] = read_frames(path)
+    return found
+
+
+def time_span(contents: Iterable[Mapping[str, Any]]) -> tuple[float, float] | None:
+    """First and last time in several transforms files; None if no frame has a time."""
+    entries = [entry for content in contents for entry in content["frames"]]
+    times = [entry[key] for entry in entries if is_number(entry.get(key := _key([entry])))]
     return (min(times), max(times)) if times else None
+
+
+def all_masks(contents: Mapping[Path, Mapping[str, Any]]) -> tuple[list[Path | None], str]:
+    """Masks of the usable images in several transforms files, and their meaning.
+
+    Args:
+        contents: Result of `readable`.
+
+    Returns:
+        As ``masks`` and ``mask_meaning`` of `Listing`.
+    """
+    masks, meaning = [], ""
+    for path, content in contents.items():
+        pairs = []
+        for entry in content["frames"]:
+            with suppress(SceneError):
+                pairs.append(_files_of("", path.parent.resolve(), content, entry)[:2])
+        found, told = _masks(pairs)
+        masks, meaning = masks + found, meaning or told
+    return masks, meaning
 
 
 def listing_of(
@@ -147,9 +174,7 @@ def listing_of(
     folder = path.parent.resolve()
     frames = _usable(path, content, folder)
     paths = [frame.image for frame in frames]
-    masks, meaning = [frame.mask for frame in frames], ""
-    if not any(masks):
-        masks, meaning = _masks_beside(paths)
+    masks, meaning = _masks([(frame.image, frame.mask) for frame in frames])
     times, source = _times(path, frames, span)
     if content.get("enable_ray_loading", True):
         _warn_of_rays(path, paths)
@@ -166,6 +191,7 @@ def listing_of(
         mask_meaning=meaning,
         clear=tuple(level for key, level in TRANSPARENT.items() if content.get(key)),
         time_source=source,
+        names=tuple(frame.entry["file_path"] for frame in frames),
     )
     warn_of_unknown(path, content)
     return listing
@@ -191,19 +217,10 @@ def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame
     def read(item: tuple[int, dict[str, Any]]) -> _Frame:
         index, entry = item
         label = f"{path}: frame {index} ({entry['file_path']})"
-        try:
-            image = image_path(label, folder, entry["file_path"])
-        except BrokenFrameError:
-            sized = entry.get("w") or content.get("w")  # Else focal lengths would be wrong.
-            found = _downscaled(folder, entry["file_path"]) if sized else None
-            if found is None:
-                raise
-            smaller.append(image := found)
+        image, mask, is_smaller = _files_of(label, folder, content, entry)
+        if is_smaller:
+            smaller.append(image)
         pose = checked_pose(label, entry["transform_matrix"])
-        mask = entry.get("mask_path") or content.get("mask_path") or None
-        mask = None if mask is None else image_path(label, folder, mask, "mask_path")
-        if mask == image:
-            raise BrokenFrameError(f"{label}: there is no mask of the name that mask_path gives.")
         if timed and entry.get(key) is None:
             problem = SceneError if 2 * timed <= len(entries) else BrokenFrameError
             raise problem(
@@ -222,11 +239,39 @@ def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame
     return frames
 
 
-def _downscaled(folder: Path, name: str) -> Path | None:
-    """The largest of nerfstudio's smaller copies of an image, as in images_2; None without any."""
-    wanted = PurePosixPath(name)
-    copies = (folder / f"{wanted.parent}_{factor}" / wanted.name for factor in (2, 4, 8))
-    return next((copy for copy in copies if wanted.parent.name and copy.is_file()), None)
+def _files_of(
+    label: str, folder: Path, content: Mapping[str, Any], entry: Mapping[str, Any]
+) -> tuple[Path, Path | None, bool]:
+    """Image and mask of a frame, and whether the image is a smaller copy of a missing one."""
+    sized, wanted = (entry.get(key) or content.get(key) for key in ("w", "mask_path"))
+    name, factors = entry["file_path"], []
+    try:
+        image = image_path(label, folder, name)
+    except BrokenFrameError:
+        # Without a size, focal lengths would be wrong.
+        found = _copy(label, folder, name, (2, 4, 8)) if sized else None
+        if found is None:
+            raise
+        image, *factors = found
+    mask = None
+    if wanted:
+        found = _copy(label, folder, wanted, factors, "mask_path")
+        mask = found[0] if found else image_path(label, folder, wanted, "mask_path")
+    if mask == image:
+        raise BrokenFrameError(f"{label}: there is no mask of the name that mask_path gives.")
+    return image, mask, bool(factors)
+
+
+def _copy(
+    label: str, folder: Path, name: Any, factors: Sequence[int], key: str = "file_path"
+) -> tuple[Path, int] | None:
+    """The first of nerfstudio's smaller copies of a file, as in images_2, and its factor."""
+    wanted = PurePosixPath(spelt(name))
+    for factor in factors if wanted.parent.name else ():
+        with suppress(BrokenFrameError):
+            copy = f"{wanted.parent}_{factor}/{wanted.name}"
+            return image_path(label, folder, copy, key), factor
+    return None
 
 
 def _warn_of_selection(path: Path, content: Mapping[str, Any]) -> None:
@@ -245,13 +290,15 @@ def _warn_of_selection(path: Path, content: Mapping[str, Any]) -> None:
         )
 
 
-def _masks_beside(paths: Sequence[Path]) -> tuple[list[Path | None], str]:
-    """Masks beside images, with instant-ngp's names, and their meaning."""
+def _masks(pairs: Sequence[tuple[Path, Path | None]]) -> tuple[list[Path | None], str]:
+    """Masks of images, or else those beside them with instant-ngp's names, and their meaning."""
+    if any(mask for _, mask in pairs):
+        return [mask for _, mask in pairs], ""
     for meaning, patterns in BESIDE.items():
-        names = [[p.format(stem=path.stem, suffix=path.suffix) for p in patterns] for path in paths]
         found = [
-            next((mask for name in each if (mask := path.with_name(name)).is_file()), None)
-            for path, each in zip(paths, names, strict=True)
+            next((mask for name in names if (mask := path.with_name(name)).is_file()), None)
+            for path, _ in pairs
+            if (names := [p.format(stem=path.stem, suffix=path.suffix) for p in patterns])
         ]
         if any(found):
             return found, meaning

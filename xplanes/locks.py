@@ -20,14 +20,17 @@ _UNLOCKABLE = OSError, NotImplementedError
 
 
 @contextmanager
-def in_turn(path: Path | None) -> Iterator[None]:
+def in_turn(path: Path | None) -> Iterator[bool]:
     """Wait for a lock, and hold it within the block.
 
     Args:
         path: The lock's file; None: no lock.
+
+    Returns:
+        Whether this process holds it; False also where files cannot be locked.
     """
     if path is None:
-        yield
+        yield False
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(path)
@@ -39,7 +42,7 @@ def in_turn(path: Path | None) -> Iterator[None]:
     except _UNLOCKABLE as problem:
         logger.warning("%s cannot be locked (%s): several processes may make it", path, problem)
     try:
-        yield
+        yield lock.is_locked
     finally:
         lock.release()
 

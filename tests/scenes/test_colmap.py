@@ -311,6 +311,14 @@ def test_models_and_images_are_found_where_programs_leave_them(capture, model, i
     assert found.views().files[0] == f"{images}/frame_000.png".removeprefix("./")
 
 
+def test_names_may_begin_with_the_folder_of_images(tmp_path):
+    capture = Capture(tmp_path / "room", [f"images/frame_{i:03d}.png" for i in range(8)])
+    (capture.path / "images/images").rename(tmp_path / "room/moved")
+    (capture.path / "images").rmdir()
+    (tmp_path / "room/moved").rename(capture.path / "images")
+    assert len(capture.views()) == 8
+
+
 def test_images_may_lie_anywhere(capture, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for root in (".", str(tmp_path)):

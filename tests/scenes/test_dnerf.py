@@ -308,7 +308,9 @@ def test_images_of_another_split_are_not_found_for_those_that_are_missing(scene)
     with told(r"test split is left out.*test/r_0\): no image"):
         scene.refused("no image", splits=["train", "test"], error=MissingSplitError)
     scene.change_each("test", file_path=lambda name: f"C:\\ball\\{name}".replace("test", "images"))
-    with told(r"2 of 2 images of the test split, such as C:/ball/images/r_0, are found only as"):
+    with told(
+        r"2 of 2 images of the test split, such as C:/ball/images/r_0, are files of training"
+    ):
         scene.read(["train", "test"])
 
 

@@ -74,8 +74,12 @@ def test_models_of_colmap_beside_it_are_preferred(folder):
     write_colmap(folder / "sparse/0", camera, images)
     assert ColmapSettings.recognises(folder)
     assert not LlffSettings.recognises(folder)
-    found = settings(ColmapSettings, "colmap", folder, static=True).load(["train"])
+    found = settings(ColmapSettings, "colmap", folder).load(["train"])
     assert found.notes["poses"].startswith("those of COLMAP; data=llff reads poses_bounds.npy")
+    assert found.splits["train"].is_static
+    assert "data.static=false" in found.notes["times"]
+    found = settings(ColmapSettings, "colmap", folder, static=False).load(["train"])
+    assert found.splits["train"].times[1] == pytest.approx(1 / 9)
     (folder / "flow").mkdir()
     assert LlffSettings.recognises(folder)
 

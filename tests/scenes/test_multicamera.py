@@ -32,6 +32,7 @@ from xplanes.scenes.multicamera import (
     Recording,
     _are_stamped,
     read_cameras,
+    recordings_of_cameras,
 )
 from xplanes.scenes.nerfstudio import NerfstudioSettings
 from xplanes.scenes.source import SceneSettings
@@ -211,6 +212,23 @@ def test_folders_of_cameras_may_have_other_names_and_levels(videos, tmp_path, ou
             write_images(place / "masks", rgb(camera))
     require_recognised(tmp_path)
     require_all(read(tmp_path, test_cameras=[name.format(0)]))
+
+
+@pytest.mark.parametrize("names", ["Camera Camera.001 Camera.002", "cam cam2", "cam_left cam_top2"])
+def test_some_cameras_have_no_number(tmp_path, names):
+    for name in names.split():
+        (tmp_path / f"{name}.mp4").write_bytes(b"")
+    (tmp_path / "camera_paths").mkdir()
+    found = recordings_of_cameras(tmp_path)
+    assert sorted(path.stem for path in found) == sorted(names.split())
+
+
+def test_cameras_may_have_an_image_of_another_kind(images):
+    for camera in range(CAMERAS):
+        save(images / f"cam{camera:02d}" / "calibration.png", rgb(camera)[0])
+    with_transforms(images, "cam{:02d}/calibration.png")
+    (images / "poses_bounds.npy").unlink()
+    assert MultiCameraSettings.recognises(images)
 
 
 def test_folders_of_single_views_are_no_cameras(tmp_path):

@@ -405,7 +405,9 @@ def check_range(site: Site, near: float, far: float) -> None:
             f"{nearest:.3g} to {farthest:.3g} world units from the centre of the field's box; set "
             "both to numbers around these"
         )
-    least, most = seen_range(site.views, scene_frame(site.views))
+    if site.bounds is not None:
+        return  # The box is larger than the scene.
+    least, most = seen_range(site.views, site.frame)
     if least < near or most > far:
         logger.warning(
             "model.sampler.near=%g with model.sampler.far=%g: the scene is %.3g to %.3g world "

@@ -35,7 +35,13 @@ from xplanes.scenes.entries import (
 )
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import Listing, held_out, time_source
-from xplanes.scenes.multicamera import POSES, are_registered, recordings_of_cameras
+from xplanes.scenes.multicamera import (
+    POSES,
+    STATIC,
+    are_registered,
+    is_dynamic,
+    recordings_of_cameras,
+)
 from xplanes.scenes.name_times import OTHER_TIMES, times_in_names
 from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.views import Scene
@@ -120,14 +126,19 @@ class ColmapSettings(CaptureSettings):
         places = self._places(listing, folders)
         scene = self.capture(listing, places, splits, model.source, points)
         notes = dict(scene.notes)
-        if (self.folder / POSES).is_file():
-            notes["poses"] = f"those of COLMAP; data=llff reads {POSES}, as a static scene"
+        if self._as_llff:
+            notes["poses"] = f"those of COLMAP; data=llff reads {POSES}"
         if points is not None and not math.isnan(model.error):
             words = f"{len(points)}, {model.error:.2f} px from where images show them on average"
             if model.error > DOUBTFUL:
                 words += "; data.refine_cameras=true corrects the cameras in training"
             notes["points"] = words
         return replace(scene, notes=notes)
+
+    @property
+    def _as_llff(self) -> bool:
+        """Whether the capture is one of LLFF's static ones, too, as in Mip-NeRF 360."""
+        return (self.folder / POSES).is_file() and not is_dynamic(self.folder)
 
     def _listing(self, model: SparseModel) -> tuple[Listing, list[str], np.ndarray | None]:
         """All images of the capture, the folder of each, and the model's points."""
@@ -181,6 +192,8 @@ class ColmapSettings(CaptureSettings):
             return [], ""
         if self.times is None:
             pattern = self.time_pattern
+            if (self.static, pattern) == (None, None) and self._as_llff:
+                return [], STATIC
             found = times_in_names(names) if pattern is None else _matched(names, labels, pattern)
             if not found:
                 return [], ""

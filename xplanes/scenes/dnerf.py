@@ -94,7 +94,7 @@ def _warn_of_shared_files(folder: Path, parts: Mapping[str, Listing]) -> None:
         if shared := [name for image, name in pairs if names.get(image, name) != name]:
             warn(
                 f"{folder}: {len(shared)} of {len(part)} images of the {split} split, such as "
-                f"{shared[0]}, are found only as files of training images. Add those of the split."
+                f"{shared[0]}, are files of training images. If they are others, add them."
             )
 
 

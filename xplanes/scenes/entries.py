@@ -35,6 +35,7 @@ Item = TypeVar("Item")
 Found = TypeVar("Found")
 
 SUFFIXES = ("", *ENDINGS)
+SPLIT_FOLDERS = ("train", "val", "test", "video")
 RIGID_TOLERANCE = 1e-3
 
 FARTHEST = 1e15
@@ -55,8 +56,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
 
     The suffix may be missing or that of another format, and the name may differ in case or in the
     encoding of accents, as long as only one file matches; it may be percent-encoded. If a path does
-    not exist, such as one of another machine, its first folders are dropped; a relative name keeps
-    its last folder. A name without folders is also tried in images.
+    not exist, such as one of another machine, its first folders are dropped, but for that of a
+    split in a relative name. A name without other folders is also tried in images.
 
     Args:
         label: The file and frame that name it, for messages.
@@ -73,8 +74,7 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         if image.is_file():
             return _with_content(label, image)
         choices.append(image)
-    bare = "/" not in spelt(name)
-    inside = [folder / "images" / path.name for path in choices if bare]
+    inside = [folder / "images" / path.name for path in choices if path.parent == folder]
     for image in inside:
         if image.is_file():
             return _with_content(label, image)
@@ -202,9 +202,10 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
             f"{label}: {key} leaves the scene's folder {folder} (it is {name}). Put its files "
             f"inside the folder and correct {key}."
         )
-    # If the path does not exist, its first folders are dropped one by one. The last one of a
-    # relative name tells apart files such as train/0001.png and test/0001.png.
-    least = 1 if PureWindowsPath(name).anchor else 2
+    # If the path does not exist, its first folders are dropped one by one. That of a split tells
+    # apart files such as train/0001.png and test/0001.png.
+    of_split = len(parts) > 1 and parts[-2].lower() in SPLIT_FOLDERS
+    least = 2 if of_split and not PureWindowsPath(name).anchor else 1
     for first in range(max(1, len(parts) - least + 1)):
         relative = Path(*parts[first:])
         if relative.is_absolute() or (first and not (folder / relative).parent.is_dir()):
@@ -487,12 +488,13 @@ def refuse_repeats(
     """
     files: dict[Path, str] = {}
     seen: dict[tuple[bytes, float], str] = {}
+    moving = len(set(times)) > 1
     for index, label in enumerate(labels):
         other = files.setdefault(paths[index], label)
         if other is not label:
             raise SceneError(f"{label} has the same file as {other}. Remove one of the two.")
         # In a static scene, a camera may pass the same place twice.
-        if len(set(times)) < 2:
+        if not moving:
             continue
         other = seen.setdefault((poses[index].tobytes(), times[index]), label)
         if other is not label:

@@ -12,13 +12,16 @@ from xplanes.scenes.entries import unit_times
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.images import native_sizes, width_rank
 from xplanes.scenes.listing import Listing, held_out, time_source
-from xplanes.scenes.multicamera import POSES, read_poses_bounds, recordings_of_cameras
+from xplanes.scenes.multicamera import (
+    POSES,
+    STATIC,
+    is_dynamic,
+    read_poses_bounds,
+    recordings_of_cameras,
+)
 from xplanes.scenes.name_times import times_in_names
 from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.views import Scene
-
-DYNAMIC = ("motion_masks", "mv_images", "flow_i1", "flow", "disp")
-"""Folders of dynamic scenes in this format, as used by NSFF and DynamicNeRF."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,10 +32,11 @@ class LlffSettings(CaptureSettings):
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:
-        known = (folder / POSES).is_file() and not recordings_of_cameras(folder)
+        if not (folder / POSES).is_file() or recordings_of_cameras(folder):
+            return False
         # As in Mip-NeRF 360's captures, COLMAP's model, which has lenses and points, is preferred.
-        kept = _is_dynamic(folder) or not ColmapSettings.recognises(folder)
-        return known and kept and bool(_image_folders(folder))
+        kept = is_dynamic(folder) or not ColmapSettings.recognises(folder)
+        return kept and bool(_image_folders(folder))
 
     def load(self, splits: Sequence[str]) -> Scene:
         path = self.folder / POSES
@@ -43,7 +47,7 @@ class LlffSettings(CaptureSettings):
         )
         names = [image.name for image in images]
         labels, poses, calibrations = zip(*read_poses_bounds(path, names), strict=True)
-        dynamic = self.static is False or _is_dynamic(self.folder)
+        dynamic = self.static is False or is_dynamic(self.folder)
         times = times_in_names(names) if dynamic else []
         listing = Listing.checked(
             path,
@@ -55,13 +59,9 @@ class LlffSettings(CaptureSettings):
             calibrations=calibrations,
             time_source=time_source("the numbers in their names", names, times)
             if times
-            else "none, as in LLFF's static captures (data.static=false takes those in the names)",
+            else STATIC,
         )
         return self.capture(listing, held_out(listing, self.eval_every), splits, path)
-
-
-def _is_dynamic(folder: Path) -> bool:
-    return any((folder / name).is_dir() for name in DYNAMIC)
 
 
 def _image_folders(folder: Path) -> list[list[Path]]:

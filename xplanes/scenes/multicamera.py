@@ -10,7 +10,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar
 
 import numpy as np
@@ -58,8 +58,17 @@ logger = logging.getLogger(__name__)
 POSES = "poses_bounds.npy"
 TRANSFORMS = "transforms.json"
 
+CAMERAS = re.compile(r"(?i)cam(?!.*path)")
+"""Beginning of the names of cameras, but not of camera_paths."""
+
 NUMBERED = re.compile(r"(?i)((view|camera|c|v)[_-]?\d+|\d\d+)")
 """Pattern of camera names other than cam*."""
+
+DYNAMIC = ("motion_masks", "mv_images", "flow_i1", "flow", "disp")
+"""Folders of dynamic scenes in LLFF's format, as used by NSFF and DynamicNeRF."""
+
+STATIC = "none, as in LLFF's static captures (data.static=false takes those in the names)"
+"""Source of the times of captures with poses_bounds.npy that have no such folder."""
 
 TIMESTEPS = "mv_images"
 """Folder with a subfolder for each timestep, as in Nvidia's Dynamic Scenes."""
@@ -248,12 +257,16 @@ def read_cameras(folder: Path) -> tuple[list[Camera], Mapping[str, Any]]:
 def recordings_of_cameras(folder: Path) -> list[Path]:
     """Videos and folders called cam*, else those with numbers such as 00 or view_01, by name."""
     inside = sorted(filter(_is_recording, folder.iterdir()))
-    named = [path for path in inside if path.name.lower().startswith("cam")]
-    # Names with digits take precedence over others, such as camera_paths.
-    if found := [path for path in named if re.search(r"\d", path.stem)]:
-        return found
-    named = [path for path in named if path.is_file() or _images_in(path)]
-    return named if len(named) > 1 else [p for p in inside if NUMBERED.fullmatch(p.stem)]
+    numbered = [path for path in inside if NUMBERED.fullmatch(path.stem)]
+    named = [path for path in inside if CAMERAS.match(path.stem)]
+    counted = [path for path in named if re.search(r"\d", path.stem)]
+    named = [path for path in named if path in counted or path.is_file() or _images_in(path)]
+    return named if counted or len(named) > 1 else numbered
+
+
+def is_dynamic(folder: Path) -> bool:
+    """Whether a capture in LLFF's format has folders of a dynamic scene."""
+    return any((folder / name).is_dir() for name in DYNAMIC)
 
 
 def are_registered(folder: Path) -> bool:
@@ -279,23 +292,23 @@ def _recordings(folder: Path, *others: str) -> list[Path]:
 def is_rig(folder: Path) -> bool:
     """Whether the frames of transforms.json name different videos or folders of several images.
 
-    If so, they are cameras rather than the images of a capture. A folder whose named image is the
-    only one of its kind, such as rgb.png beside depth.png, is a view of a capture.
+    If so, they are cameras rather than the images of a capture. A folder with one image of a kind,
+    such as rgb.png beside depth.png, is a view of a capture.
     """
 
     def kind(name: str) -> str:
-        return re.sub(r"\d+", "#", PureWindowsPath(name).stem)
+        return re.sub(r"\d+", "#", PurePosixPath(name).stem)
 
     sources: set[Path] = set()
     try:
         for frame in read_frames(folder / TRANSFORMS)["frames"]:
             source = _source("", folder.resolve(), frame["file_path"])
-            if source.is_dir():
-                kinds = [kind(path.name) for path in _images_in(source)]
-                if len(kinds) < 2 or kinds.count(kind(frame["file_path"])) == 1:
-                    return False
             if source in sources:
                 return False
+            if source.is_dir():
+                kinds = [kind(path.name) for path in _images_in(source)]
+                if len({*kinds}) == len(kinds):
+                    return False
             sources.add(source)
     except SceneError:
         return False

@@ -30,9 +30,15 @@ CLOCK = re.compile(r"(?<![A-Za-z\d])\d+\.\d+(?=s?$)|(?<!\d)(\d{10})[_-](\d{9}|\d
 
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_.T ]*(?:at )?"
-    r"(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)(?:[_-](?=\d{3}(?!\d))|[s.]?)(\d*)"
+    r"(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)[s.]?(\d*)"
 )
-"""Date and time of day, with parts of a second, as in PXL_20260102_115959250 and IMG_..._250."""
+"""Date and time of day, with parts of a second, as in PXL_20260102_115959250."""
+
+MILLISECONDS = re.compile(DATE.pattern + r"[_-](\d{3})(?!\d)")
+"""Date, time of day and perhaps milliseconds, as in IMG_20260102_115959_250."""
+
+COPY = re.compile(r"\s*\((\d+)\)$")
+"""The number that browsers and file managers add to names of copies, as in clip_1(3)."""
 
 NUMBER = r"(?:(?:(?<=[_ ])|^)-)?\d+"
 """A whole number; a sign belongs to it at the beginning, or after a separator."""
@@ -51,8 +57,8 @@ def times_in_names(names: Sequence[str]) -> list[Number]:
         names: Names of the images, with their folders. [V]
     """
     stems = [PurePosixPath(name).stem for name in names]
-    for read in (_date, _clock):
-        times = [read(stem) for stem in stems]
+    for read in (_dates, _clocks):
+        times = read(stems)
         found = [time for time in times if time is not None]
         if len(found) == len(names) and not _few(names, found):
             return _checked(names, found)
@@ -67,6 +73,27 @@ def times_in_names(names: Sequence[str]) -> list[Number]:
         warn(f"{why}: all images are taken for one timestep. {OTHER_TIMES}")
         return []
     return _checked(names, found, by_file=texts is not whole)
+
+
+def _dates(stems: Sequence[str]) -> list[float | None]:
+    """Seconds of the date and time of day in each name."""
+    times = [_date(stem) for stem in stems]
+    matches = [MILLISECONDS.search(stem) for stem in stems]
+    found = [
+        (time, int(match[8]))
+        for time, match in zip(times, matches, strict=True)
+        if time is not None and match is not None
+    ]
+    counted = all(
+        after in (0, 1, before + 1) for (_, before), (_, after) in pairwise(sorted(found))
+    )
+    if counted or len(found) < len(stems):  # Numbers of images, not milliseconds.
+        return times
+    return [time + part / 1000 for time, part in found]
+
+
+def _clocks(stems: Sequence[str]) -> list[float | None]:
+    return [_clock(stem) for stem in stems]
 
 
 def _date(stem: str) -> float | None:
@@ -91,17 +118,21 @@ def _clock(stem: str) -> float | None:
 def _most_different(texts: Sequence[str]) -> list[Number]:
     """The number in each name at the position where numbers vary most, or the last such position.
 
-    If no position that all names have varies, the last number of those that have more, such as 3 in
-    clip_1(3), and 0 for the others. Empty if a name has none.
+    If names have different counts of numbers, the last number of each, if that varies more. Numbers
+    of copies, such as 3 in clip_1(3), count if no other varies. Empty if a name has no number.
     """
-    rows = [re.findall(NUMBER, text) for text in texts]
+    rows = [re.findall(NUMBER, COPY.sub("", text)) for text in texts]
+    if not all(rows):
+        rows = [re.findall(NUMBER, text) for text in texts]
     if not all(rows):
         return []
-    least = min(map(len, rows))
-    place = max(range(least), key=lambda column: (len({row[column] for row in rows}), column))
-    if len({row[place] for row in rows}) == 1 and max(map(len, rows)) > least:
-        return [int(row[-1]) if len(row) > least else 0 for row in rows]
-    return [int(row[place]) for row in rows]
+    shared = range(min(map(len, rows)))
+    place = max(shared, key=lambda column: (len({row[column] for row in rows}), column))
+    copies = [int(match[1]) if (match := COPY.search(text)) else 0 for text in texts]
+    varying = [int(row[place]) for row in rows], [int(row[-1]) for row in rows], copies
+    kinds = [len(set(numbers)) for numbers in varying[:2]]
+    found = varying[2] if max(kinds) == 1 else varying[kinds.index(max(kinds))]
+    return list(found)
 
 
 def _no_series(names: Sequence[str], stems: Sequence[str], found: Sequence[Number]) -> str | None:
@@ -152,8 +183,11 @@ def _checked(names: Sequence[str], times: list[Number], by_file: bool = False) -
     if not why and _few(names, times):
         why = f"are only {len(set(times))}, for {len(names)} images"
     folders = Counter(PurePosixPath(name).parent.name for name in names)
-    alike = len({re.sub(r"\d+", "#", folder) for folder in folders}) == 1
-    timesteps = alike and len(folders) > max(folders.values())
+    timesteps = len(folders) > 1 and all(re.fullmatch(r"\d{4,}", folder) for folder in folders)
+    if len({re.sub(r"\d+", "#", folder) for folder in folders}) == 1:
+        # Files of few digits are cameras rather than frames.
+        short = all(len(re.sub(r"\D", "", PurePosixPath(name).stem)) < 3 for name in names)
+        timesteps |= short and len(folders) > max(folders.values())
     if not why and by_file and timesteps and not any(map(CAMERA.search, folders)):
         found = some(sorted(folders))
         why = f"are those of the files, and the folders {found} are taken for cameras"

@@ -54,7 +54,7 @@ def _listed_splits(
 ) -> dict[str, list[int]] | None:
     """Indices of the frames that the file lists for each split; None if it lists no splits."""
     listed = {split: content.get(f"{split}_filenames") for split in SPLITS}
-    if all(names is None for names in listed.values()):
+    if not any(listed.values()):
         return None
     # Frames by name, None for those that are left out, and by file for names spelt differently.
     places: dict[str | Path, int | None] = dict.fromkeys(

@@ -321,11 +321,11 @@ def _decoded(
         require_writable(folder)
     except StorageError as problem:
         raise StorageError(f"{problem}: data.cache names the one for decoded images") from problem
-    with in_turn(path.with_suffix(".lock")):
+    with in_turn(path.with_suffix(".lock")) as alone:
         if (ready := stored()) is not None:
             return ready
         # The lock's owner may remove unfinished files of this name.
-        for leftover in folder.glob(f".{path.name}{MARK}*"):
+        for leftover in folder.glob(f".{path.name}{MARK}*") if alone else ():
             leftover.unlink(missing_ok=True)
         if is_default:
             _remove_unused(folder)

@@ -100,7 +100,8 @@ IGNORED = (
     *("colmap_im_id", "colmap_image_id", "camera_id", "cam_id", "component_id", "id", "name"),
     *("depth_file_path", "depth_path", "integer_depth_scale", "enable_depth_loading"),
     *("normal_file_path", "depth_unit_scale_factor", "rotation", "render_aabb", "path"),
-    *("crop_width", "crop_height", "blur_score", "n_images", "fps"),
+    *("crop_width", "crop_height", "blur_score", "n_images", "fps", "num_frames", "split"),
+    *("camera", "camera_label", "camera_name", "cam_name"),
 )
 """Keys of other programs without effect here."""
 

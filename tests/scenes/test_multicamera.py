@@ -218,7 +218,8 @@ def test_folders_of_cameras_may_have_other_names_and_levels(videos, tmp_path, ou
 def test_some_cameras_have_no_number(tmp_path, names):
     for name in names.split():
         (tmp_path / f"{name}.mp4").write_bytes(b"")
-    (tmp_path / "camera_paths").mkdir()
+    for name in ("camera_paths", "cam_calib"):
+        save(tmp_path / name / "0.png", rgb(0)[0])
     found = recordings_of_cameras(tmp_path)
     assert sorted(path.stem for path in found) == sorted(names.split())
 

@@ -734,6 +734,13 @@ def test_images_are_found_by_names_that_are_nearly_theirs(capture, new):
     assert len(capture.all()) == 10
 
 
+def test_an_image_that_a_folder_lacks_is_not_that_of_another_folder(capture):
+    (capture.path / "right").mkdir()
+    capture.change(3, file_path="right/frame_00003.png")
+    with told(r"1 of 10 frames are left out:(.|\n)*frame 3.*no image"):
+        assert len(capture.all()) == 9
+
+
 def test_a_link_to_nothing_is_a_missing_image(capture):
     capture.image(3).unlink()
     capture.image(3).symlink_to(capture.path.parent / "gone.png")

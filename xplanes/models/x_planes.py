@@ -98,8 +98,8 @@ class XPlanesLoss(Settings):
     time_variation: Weight  # Weight of the time planes' total variation.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the time planes' mean square.
-    # Weight of the cube's mean transmittance, if a background is learnt; it falls to 0 over
-    # `model.loss.passing_steps`. The background learns faster than the field, and would otherwise
+    # Weight of the cube's mean transmittance, if a background is learnt and the field is initialised
+    # randomly; it falls to 0 over `model.loss.passing_steps`. The background learns faster than the field, and would otherwise
     # reproduce the cube's content. Time planes are not trained until then: they would build fog
     # that differs from view to view, blocks the light and persists.
     passing: Weight
@@ -283,6 +283,7 @@ class XPlanesModel(Model):
         self.fine_start = 0 if settings.fine is None else site.steps(settings.fine.start)
         self.fine_warmup = site.steps(FINE_WARMUP)
         self.opacity = self.weights.opacity
+        self._shows_scene = site.initialised
         self._opaque = site.views is not None and site.views.is_opaque
         self.product: SparseProduct | None = None
         self.initial_weight, self._initial = 0.0, []
@@ -435,9 +436,9 @@ class XPlanesModel(Model):
         )
 
     def _passing(self, step: int) -> float:
-        """Weight of the cube's mean transmittance; 0 without a learnt background."""
+        """Weight of the cube's mean transmittance; 0 for an initialised field, or no background."""
         steps = self.weights.passing_steps
-        if self._field.background is None or not steps:
+        if self._shows_scene or self._field.background is None or not steps:
             return 0.0
         return self.weights.passing * max(0.0, 1 - step / steps)
 

@@ -56,8 +56,9 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
 
     The suffix may be missing or that of another format, and the name may differ in case or in the
     encoding of accents, as long as only one file matches; it may be percent-encoded. If a path does
-    not exist, such as one of another machine, its first folders are dropped, but for that of a
-    split in a relative name. A name without other folders is also tried in images.
+    not exist, such as one of another machine, its first folders are dropped; in a relative name,
+    not that of a split, nor any if its own folder exists. What is then left without folders is also
+    tried in images.
 
     Args:
         label: The file and frame that name it, for messages.
@@ -203,10 +204,12 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
             f"inside the folder and correct {key}."
         )
     # If the path does not exist, its first folders are dropped one by one. That of a split tells
-    # apart files such as train/0001.png and test/0001.png.
-    of_split = len(parts) > 1 and parts[-2].lower() in SPLIT_FOLDERS
-    least = 2 if of_split and not PureWindowsPath(name).anchor else 1
-    for first in range(max(1, len(parts) - least + 1)):
+    # apart files such as train/0001.png and test/0001.png, and so does a folder that exists.
+    last, own = len(parts), parts[:-1]
+    if own and not PureWindowsPath(name).anchor:
+        splits = [place for place, part in enumerate(own) if part.lower() in SPLIT_FOLDERS]
+        last = 1 if folder.joinpath(*own).is_dir() else min([*(p + 1 for p in splits), last])
+    for first in range(max(1, last)):
         relative = Path(*parts[first:])
         if relative.is_absolute() or (first and not (folder / relative).parent.is_dir()):
             continue

@@ -58,8 +58,8 @@ logger = logging.getLogger(__name__)
 POSES = "poses_bounds.npy"
 TRANSFORMS = "transforms.json"
 
-CAMERAS = re.compile(r"(?i)cam(?!.*path)")
-"""Beginning of the names of cameras, but not of camera_paths."""
+CAMERAS = re.compile(r"(?i)cam(?!.*(path|calib|traj|param|vis))(?!eras$)")
+"""Beginning of the names of cameras, but not of camera_paths, cam_calib and the like."""
 
 NUMBERED = re.compile(r"(?i)((view|camera|c|v)[_-]?\d+|\d\d+)")
 """Pattern of camera names other than cam*."""
@@ -292,8 +292,8 @@ def _recordings(folder: Path, *others: str) -> list[Path]:
 def is_rig(folder: Path) -> bool:
     """Whether the frames of transforms.json name different videos or folders of several images.
 
-    If so, they are cameras rather than the images of a capture. A folder with one image of a kind,
-    such as rgb.png beside depth.png, is a view of a capture.
+    If so, they are cameras rather than the images of a capture. A folder whose images are all of
+    different kinds, such as rgb.png beside depth.png, is a view of a capture.
     """
 
     def kind(name: str) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import PurePosixPath
+from statistics import median
 
 from xplanes.errors import warn
 from xplanes.files import natural
@@ -36,6 +37,9 @@ DATE = re.compile(
 
 MILLISECONDS = re.compile(DATE.pattern + r"[_-](\d{3})(?!\d)")
 """Date, time of day and perhaps milliseconds, as in IMG_20260102_115959_250."""
+
+LEAST_STEP = 10
+"""Least median interval between images of one second, in milliseconds."""
 
 COPY = re.compile(r"\s*\((\d+)\)$")
 """The number that browsers and file managers add to names of copies, as in clip_1(3)."""
@@ -84,10 +88,11 @@ def _dates(stems: Sequence[str]) -> list[float | None]:
         for time, match in zip(times, matches, strict=True)
         if time is not None and match is not None
     ]
-    counted = all(
-        after in (0, 1, before + 1) for (_, before), (_, after) in pairwise(sorted(found))
-    )
-    if counted or len(found) < len(stems):  # Numbers of images, not milliseconds.
+    pairs = [*pairwise(sorted(set(found)))]
+    steps = [after - before for (one, before), (other, after) in pairs if one == other]
+    # Numbers of images, not milliseconds: no camera takes a hundred images a second.
+    counted = all(after in (0, 1, before + 1) for (_, before), (_, after) in pairs)
+    if len(found) < len(stems) or (median(steps) < LEAST_STEP if steps else counted):
         return times
     return [time + part / 1000 for time, part in found]
 
@@ -128,7 +133,8 @@ def _most_different(texts: Sequence[str]) -> list[Number]:
         return []
     shared = range(min(map(len, rows)))
     place = max(shared, key=lambda column: (len({row[column] for row in rows}), column))
-    copies = [int(match[1]) if (match := COPY.search(text)) else 0 for text in texts]
+    # The first of several may have no number, or 0.
+    copies = [int(match[1]) if (match := COPY.search(text)) else -1 for text in texts]
     varying = [int(row[place]) for row in rows], [int(row[-1]) for row in rows], copies
     kinds = [len(set(numbers)) for numbers in varying[:2]]
     found = varying[2] if max(kinds) == 1 else varying[kinds.index(max(kinds))]
@@ -183,7 +189,9 @@ def _checked(names: Sequence[str], times: list[Number], by_file: bool = False) -
     if not why and _few(names, times):
         why = f"are only {len(set(times))}, for {len(names)} images"
     folders = Counter(PurePosixPath(name).parent.name for name in names)
-    timesteps = len(folders) > 1 and all(re.fullmatch(r"\d{4,}", folder) for folder in folders)
+    # Numbers with large gaps are those of devices.
+    counts = [int(folder) for folder in folders if re.fullmatch(r"\d{4,6}", folder)]
+    timesteps = 1 < len(folders) == len(counts) and max(counts) - min(counts) < 2 * len(counts)
     if len({re.sub(r"\d+", "#", folder) for folder in folders}) == 1:
         # Files of few digits are cameras rather than frames.
         short = all(len(re.sub(r"\D", "", PurePosixPath(name).stem)) < 3 for name in names)

@@ -100,7 +100,7 @@ IGNORED = (
     *("colmap_im_id", "colmap_image_id", "camera_id", "cam_id", "component_id", "id", "name"),
     *("depth_file_path", "depth_path", "integer_depth_scale", "enable_depth_loading"),
     *("normal_file_path", "depth_unit_scale_factor", "rotation", "render_aabb", "path"),
-    *("crop_width", "crop_height", "blur_score", "n_images", "fps", "num_frames", "split"),
+    *("crop_width", "crop_height", "blur_score", "n_images", "fps", "num_frames"),
     *("camera", "camera_label", "camera_name", "cam_name"),
 )
 """Keys of other programs without effect here."""
@@ -270,8 +270,10 @@ def _copy(
     wanted = PurePosixPath(spelt(name))
     for factor in factors if wanted.parent.name else ():
         with suppress(BrokenFrameError):
-            copy = f"{wanted.parent}_{factor}/{wanted.name}"
-            return image_path(label, folder, copy, key), factor
+            place = f"{wanted.parent}_{factor}"
+            copy = image_path(label, folder, f"{place}/{wanted.name}", key)
+            if copy.parent.name.lower() == PurePosixPath(place).name.lower():
+                return copy, factor
     return None
 
 

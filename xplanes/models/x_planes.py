@@ -98,10 +98,11 @@ class XPlanesLoss(Settings):
     time_variation: Weight  # Weight of the time planes' total variation.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the time planes' mean square.
-    # Weight of the cube's mean transmittance, if a background is learnt and the field is initialised
-    # randomly; it falls to 0 over `model.loss.passing_steps`. The background learns faster than the field, and would otherwise
-    # reproduce the cube's content. Time planes are not trained until then: they would build fog
-    # that differs from view to view, blocks the light and persists.
+    # Weight of the cube's mean transmittance, if a background is learnt and the field is
+    # initialised randomly; it falls to 0 over `model.loss.passing_steps`. The background learns
+    # faster than the field, and would otherwise reproduce the cube's content. Time planes are not
+    # trained until then: they would build fog that differs from view to view, blocks the light and
+    # persists.
     passing: Weight
     passing_steps: Steps  # Steps over which `model.loss.passing` falls to 0.
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.

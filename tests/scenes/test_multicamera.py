@@ -26,15 +26,9 @@ from xplanes.scenes import videos as recordings
 from xplanes.scenes.colmap import ColmapSettings
 from xplanes.scenes.listing import Calibration
 from xplanes.scenes.llff import LlffSettings
-from xplanes.scenes.multicamera import (
-    Camera,
-    MultiCameraSettings,
-    Recording,
-    _are_stamped,
-    read_cameras,
-    recordings_of_cameras,
-)
+from xplanes.scenes.multicamera import MultiCameraSettings, Recording, _are_stamped
 from xplanes.scenes.nerfstudio import NerfstudioSettings
+from xplanes.scenes.rigs import Camera, read_cameras, recordings_of_cameras
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
 
@@ -222,6 +216,13 @@ def test_some_cameras_have_no_number(tmp_path, names):
         save(tmp_path / name / "0.png", rgb(0)[0])
     found = recordings_of_cameras(tmp_path)
     assert sorted(path.stem for path in found) == sorted(names.split())
+
+
+def test_folders_may_have_names_with_dots(videos, tmp_path):
+    shutil.copy(videos / "poses_bounds.npy", tmp_path)
+    for camera in range(CAMERAS):
+        write_images(tmp_path / f"Camera.{camera:03d}", rgb(camera))
+    require_all(read(tmp_path, test_cameras=["Camera.000"]))
 
 
 def test_cameras_may_have_an_image_of_another_kind(images):

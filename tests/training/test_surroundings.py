@@ -126,8 +126,8 @@ def test_time_planes_wait_as_long_as_light_that_passes_the_cube_costs():
         assert rates[0] > 0
         assert rates[1] == (0 if waits else rates[0])
     priceless = built("world", "model.loss.passing=0").model
-    shaped = built("world").model
-    shaped._shows_scene = True  # An LRM has given it its shape.
+    site = replace(world.site, initialised=True)  # An LRM has given the field its shape.
+    shaped = world.model.settings.build(site)
     for model in (priceless, shaped):
         assert model.rate_of("time", 150, 0.1) == model.rate_of("space", 150, 0.1)
 

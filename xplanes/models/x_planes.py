@@ -274,6 +274,8 @@ class XPlanesModel(Model):
         self.total_variation = self.weights.total_variation
         if field.background is not None:
             self.weights = settings.loss.with_learnt_background()
+            if site.initialised:  # Its surfaces stop light already.
+                self.weights = replace(self.weights, passing=0.0)
             self.total_variation = self.weights.total_variation_with_background
         elif self.fine is not None:
             self.total_variation = self.fine.coarse_variation
@@ -284,7 +286,6 @@ class XPlanesModel(Model):
         self.fine_start = 0 if settings.fine is None else site.steps(settings.fine.start)
         self.fine_warmup = site.steps(FINE_WARMUP)
         self.opacity = self.weights.opacity
-        self._shows_scene = site.initialised
         self._opaque = site.views is not None and site.views.is_opaque
         self.product: SparseProduct | None = None
         self.initial_weight, self._initial = 0.0, []
@@ -437,9 +438,9 @@ class XPlanesModel(Model):
         )
 
     def _passing(self, step: int) -> float:
-        """Weight of the cube's mean transmittance; 0 for an initialised field, or no background."""
+        """Weight of the cube's mean transmittance; 0 without a learnt background."""
         steps = self.weights.passing_steps
-        if self._shows_scene or self._field.background is None or not steps:
+        if self._field.background is None or not steps:
             return 0.0
         return self.weights.passing * max(0.0, 1 - step / steps)
 

@@ -1,17 +1,11 @@
-"""Videos of several fixed cameras: Neural 3D Video, or a folder with a calibration.
-
-Neural 3D Video has the calibration in poses_bounds.npy and the videos cam00.mp4, cam01.mp4, ... in
-the same order. In other folders a transforms.json names each camera's video, its folder of images,
-or one of these images; or COLMAP has registered one image per camera, with the name of the camera.
-"""
+"""Synchronised videos, or folders of images, of several fixed cameras (`rigs`)."""
 
 import logging
 import re
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -20,18 +14,13 @@ from torch import Tensor
 from xplanes.errors import ConfigError, MissingSplitError, SceneError, refuse_all, warn
 from xplanes.files import natural
 from xplanes.scenes import store, videos
-from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, image_count, read_model
 from xplanes.scenes.entries import (
-    checked_pose,
-    is_positive,
     origin_near,
-    paths_inside,
-    require_fetched,
     some,
     unit_times,
     world_turn,
 )
-from xplanes.scenes.formats import ENDINGS, is_image, read_header
+from xplanes.scenes.formats import ENDINGS, read_header
 from xplanes.scenes.images import (
     Size,
     cleared,
@@ -41,52 +30,30 @@ from xplanes.scenes.images import (
     read_image,
     shrink,
 )
-from xplanes.scenes.listing import Calibration, final_intrinsics, misshapen
+from xplanes.scenes.listing import final_intrinsics, misshapen
 from xplanes.scenes.name_times import DATE
+from xplanes.scenes.rigs import (
+    POSES,
+    Camera,
+    are_registered,
+    images_in,
+    is_rig,
+    read_cameras,
+    recordings_below,
+)
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.transforms import (
-    TRANSPARENT,
-    read_calibration,
-    read_frames,
     stated_up,
-    warn_of_unknown,
 )
 from xplanes.scenes.views import Scene, Views
 
 logger = logging.getLogger(__name__)
-
-POSES = "poses_bounds.npy"
-TRANSFORMS = "transforms.json"
-
-CAMERAS = re.compile(r"(?i)cam(?!.*(path|calib|traj|param|vis))(?!eras$)")
-"""Beginning of the names of cameras, but not of camera_paths, cam_calib and the like."""
-
-NUMBERED = re.compile(r"(?i)((view|camera|c|v)[_-]?\d+|\d\d+)")
-"""Pattern of camera names other than cam*."""
-
-DYNAMIC = ("motion_masks", "mv_images", "flow_i1", "flow", "disp")
-"""Folders of dynamic scenes in LLFF's format, as used by NSFF and DynamicNeRF."""
-
-STATIC = "none, as in LLFF's static captures (data.static=false takes those in the names)"
-"""Source of the times of captures with poses_bounds.npy that have no such folder."""
-
-TIMESTEPS = "mv_images"
-"""Folder with a subfolder for each timestep, as in Nvidia's Dynamic Scenes."""
-
-UNREAD = ("mask_path", *TRANSPARENT, "train_filenames", "val_filenames", "test_filenames")
-"""Keys of transforms files that are read of captures, but not of several fixed cameras."""
-
-IMAGES = ("images", "image", "rgb", "frames")
-"""Names of the subfolder with a camera's images, if the camera has several subfolders."""
 
 MOST_DRIFT = 0.5
 """Largest drift between synchronised cameras until the shortest of them ends, in frames."""
 
 LATE = 1.5
 """A longer gap between frames, relative to the median gap, indicates a variable frame rate."""
-
-SAME_POSE = 1e-4
-"""Largest difference between poses of a fixed camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +91,7 @@ class MultiCameraSettings(SceneSettings):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         if (folder / POSES).is_file():
-            return bool(_recordings(folder))
+            return bool(recordings_below(folder))
         return is_rig(folder) or are_registered(folder)
 
     def load(self, splits: Sequence[str]) -> Scene:
@@ -177,25 +144,6 @@ class MultiCameraSettings(SceneSettings):
 
 
 @dataclass(frozen=True)
-class Camera:
-    """A fixed camera and the source of its frames.
-
-    Attributes:
-        name: Name of its video, or of its folder of images.
-        source: The video, or the folder of images.
-        pose: Camera-to-world matrix with OpenGL's axes. float64 [4, 4]
-        calibration: Its focal length, principal point and lens.
-        label: The file and entry of its calibration, for messages.
-    """
-
-    name: str
-    source: Path
-    pose: np.ndarray
-    calibration: Calibration
-    label: str
-
-
-@dataclass(frozen=True)
 class Recording:
     """The frames of a camera.
 
@@ -220,269 +168,6 @@ class Recording:
     def step(self) -> float:
         """Median seconds between frames; 0 if unknown."""
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
-
-
-def read_cameras(folder: Path) -> tuple[list[Camera], Mapping[str, Any]]:
-    """The calibrated cameras of a folder, in the order of its calibration.
-
-    Returns:
-        The cameras, and the content of transforms.json; empty for other calibrations.
-
-    Raises:
-        SceneError: If it has no calibration, or one that does not fit its videos and images.
-    """
-    content: Mapping[str, Any] = {}
-    if (folder / POSES).is_file():
-        cameras = _from_poses_bounds(folder)
-    elif (folder / TRANSFORMS).is_file():
-        content = read_frames(folder / TRANSFORMS)
-        cameras = _from_transforms(folder, content)
-    elif (model := find_model(folder)) is not None:
-        cameras = _from_colmap(folder, model)
-    else:
-        found = ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "nothing"
-        raise SceneError(
-            f"{folder} holds neither {POSES} (Neural 3D Video) nor {TRANSFORMS} (a frame for each "
-            f"camera) nor {MODELS[0]} (COLMAP's model of an image of each), but {found}. Add the "
-            "calibration of the cameras."
-        )
-    names = [camera.name for camera in cameras]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise SceneError(
-            f"{folder}: several cameras are called {twice[0]}. Rename their videos or folders."
-        )
-    return cameras, content
-
-
-def recordings_of_cameras(folder: Path) -> list[Path]:
-    """Videos and folders called cam*, else those with numbers such as 00 or view_01, by name."""
-    inside = sorted(filter(_is_recording, folder.iterdir()))
-    numbered = [path for path in inside if NUMBERED.fullmatch(path.stem)]
-    named = [path for path in inside if CAMERAS.match(path.stem)]
-    counted = [path for path in named if re.search(r"\d", path.stem)]
-    named = [path for path in named if path in counted or path.is_file() or _images_in(path)]
-    return named if counted or len(named) > 1 else numbered
-
-
-def is_dynamic(folder: Path) -> bool:
-    """Whether a capture in LLFF's format has folders of a dynamic scene."""
-    return any((folder / name).is_dir() for name in DYNAMIC)
-
-
-def are_registered(folder: Path) -> bool:
-    """Whether COLMAP registered an image of each of several cameras, not those of a capture."""
-    # A transforms.json that was converted from another model takes precedence.
-    place = find_model(folder, MODELS[:2] if (folder / TRANSFORMS).is_file() else MODELS)
-    if place is None or len(recordings_of_cameras(folder)) > 1:
-        return place is not None
-    found = _recordings(folder, "images")
-    return len(found) > 1 and 1 < image_count(place) <= len(found)
-
-
-def _recordings(folder: Path, *others: str) -> list[Path]:
-    """Recordings in a folder, or in its only subfolder, but for ``others``, that has some."""
-    if found := recordings_of_cameras(folder):
-        return found
-    others = (TIMESTEPS, *others)
-    inside = [path for path in folder.iterdir() if path.is_dir() and path.name not in others]
-    deeper = [paths for path in inside if (paths := recordings_of_cameras(path))]
-    return deeper[0] if len(deeper) == 1 else []
-
-
-def is_rig(folder: Path) -> bool:
-    """Whether the frames of transforms.json name different videos or folders of several images.
-
-    If so, they are cameras rather than the images of a capture. A folder whose images are all of
-    different kinds, such as rgb.png beside depth.png, is a view of a capture.
-    """
-
-    def kind(name: str) -> str:
-        return re.sub(r"\d+", "#", PurePosixPath(name).stem)
-
-    sources: set[Path] = set()
-    try:
-        for frame in read_frames(folder / TRANSFORMS)["frames"]:
-            source = _source("", folder.resolve(), frame["file_path"])
-            if source in sources:
-                return False
-            if source.is_dir():
-                kinds = [kind(path.name) for path in _images_in(source)]
-                if len({*kinds}) == len(kinds):
-                    return False
-            sources.add(source)
-    except SceneError:
-        return False
-    return len(sources) > 1
-
-
-def _is_recording(path: Path) -> bool:
-    return path.is_dir() or path.suffix.lower() in videos.SUFFIXES
-
-
-def _from_poses_bounds(folder: Path) -> list[Camera]:
-    """Cameras of poses_bounds.npy; its rows are in the order of the videos' or folders' names."""
-    path = folder / POSES
-    # A video may be beside a folder of images extracted from it.
-    sources = list({source.stem: source for source in _recordings(folder)}.values())
-    names = [source.name for source in sources]
-    if names != sorted(names, key=natural):
-        pairs = ", ".join(f"row {row} is {name}" for row, name in enumerate(names[:3]))
-        warn(
-            f"{path}: rows are in the plain order of names, as LLFF writes them: {pairs}. If they "
-            "have the order of the numbers, write these with leading zeros."
-        )
-    rows = read_poses_bounds(path, names)
-    return [
-        Camera(source.stem, source, pose, calibration, label)
-        for source, (label, pose, calibration) in zip(sources, rows, strict=True)
-    ]
-
-
-def read_poses_bounds(
-    path: Path, names: Sequence[str]
-) -> list[tuple[str, np.ndarray, Calibration]]:
-    """Label, pose and calibration of each row of poses_bounds.npy.
-
-    Args:
-        path: The file.
-        names: Images, videos or folders of the rows, in order.
-
-    Raises:
-        SceneError: If it cannot be read, or has another number of rows.
-    """
-    require_fetched(path)
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as problem:
-        raise SceneError(
-            f"{path} cannot be read as an array ({problem}). Export or download it again."
-        ) from problem
-    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
-        raise SceneError(
-            f"{path} holds {rows.dtype} {list(rows.shape)}, not one row of 17 numbers for each "
-            "camera: a pose of 3 rows and 5 columns, then the nearest and the farthest depth."
-        )
-    if len(names) != len(rows):
-        raise SceneError(
-            f"{path} has {len(rows)} cameras, but {path.parent} holds {len(names)} (cam*, or "
-            f"numbers): {some(names) or 'none'}. Add what is missing, or take the others' rows out."
-        )
-    cameras = []
-    for index, (name, row) in enumerate(zip(names, rows, strict=True)):
-        label = f"{path}: row {index} ({name})"
-        matrix = row[:15].astype(np.float64).reshape(3, 5)
-        down, right, back, centre, (height, width, focal) = matrix.T
-        for key, value in (("height", height), ("width", width), ("focal length", focal)):
-            if not is_positive(float(value)):
-                raise SceneError(f"{label}: {key} is {value:g}; it must be above 0. Export again.")
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, -down, back, centre], axis=1)
-        pose = checked_pose(label, pose, "the pose")
-        calibration = Calibration(fl_x=float(focal), w=float(width), h=float(height))
-        cameras.append((label, pose, calibration))
-    return cameras
-
-
-def _from_transforms(folder: Path, content: Mapping[str, Any]) -> list[Camera]:
-    """Cameras of transforms.json: one frame per camera, or several with the same pose."""
-    path = folder / TRANSFORMS
-    cameras: dict[Path, Camera] = {}
-    for index, frame in enumerate(content["frames"]):
-        label = f"{path}: frame {index} ({frame['file_path']})"
-        source = _source(label, folder.resolve(), frame["file_path"])
-        pose = checked_pose(label, frame["transform_matrix"])
-        if (other := cameras.get(source)) is not None:
-            if np.abs(other.pose - pose).max() > SAME_POSE:
-                raise SceneError(
-                    f"{label} has another pose than {other.label}, but both lead to {source}, "
-                    "and cameras must not move. Read a moving camera with data=nerfstudio."
-                )
-            continue
-        calibration = read_calibration(str(path), content, label, frame)
-        cameras[source] = Camera(source.stem, source, pose, calibration, label)
-    warn_of_unknown(path, content, UNREAD)
-    return list(cameras.values())
-
-
-def _from_colmap(folder: Path, place: Path) -> list[Camera]:
-    """Cameras of a sparse model with one registered image per camera."""
-    model = read_model(place)
-    recordings = _recordings(folder, "images")
-    folder = recordings[0].parent if recordings else folder
-    sources: dict[str, list[Path]] = defaultdict(list)
-    for path in sorted(folder.iterdir()):
-        if _is_recording(path):
-            sources[path.stem].append(path)
-    # Other folders, such as images and sparse, need not be cameras.
-    expected = {path for paths in sources.values() for path in paths if path.is_file()}
-    expected = sorted(expected | set(recordings))
-    sources |= _counted(model, recordings)
-    owned: dict[Path, list[str]] = {path: [] for path in expected}
-    cameras, problems = [], []
-    for name, pose, calibration in zip(
-        model.names, model.camera_to_world, model.calibrations, strict=True
-    ):
-        image = PurePosixPath(name)
-        found = [
-            path
-            for text in dict.fromkeys((image.stem, image.parent.name))
-            # A video may be beside a folder of images extracted from it.
-            for path in [path for path in sources[text] if path.is_file()] or sources[text]
-        ]
-        for path in found:
-            owned.setdefault(path, []).append(name)
-            label = f"{model.source}: {name}"
-            cameras.append(Camera(path.stem, path, pose, calibration, label))
-        if len(found) != 1:
-            words = " or of ".join(path.name for path in found)
-            problems.append(f"{name} may be of {words or 'no video or folder'}")
-    known = {path.stem for path, names in owned.items() if names}
-    for path, names in owned.items():
-        if len(names) > 1 or path.stem not in known:
-            problems.append(f"{some(names) or 'no registered image'} belongs to {path.name}")
-    if problems:
-        raise SceneError(
-            f"{model.source}: {some(problems)}. One image of each camera must be registered, and "
-            "have its name: cam00.png or cam00/0001.png for cam00.mp4, or for the folder cam00. "
-            f"Registered images: {some(model.names)}. Videos, and folders of the name cam*, in "
-            f"{folder}: {some([path.name for path in expected]) or 'none'}. Move what is not a "
-            "camera elsewhere, or read all registered images with data=colmap."
-        )
-    return cameras
-
-
-def _counted(model: SparseModel, recordings: Sequence[Path]) -> dict[str, list[Path]]:
-    """Recordings by image1, image2, ..., in order; empty if images have other names.
-
-    4DGaussians copies an image of each camera to these names.
-    """
-    named = {path.stem: path for path in recordings}
-    counted = {f"image{place}": [path] for place, path in enumerate(named.values(), start=1)}
-    if sorted(counted) != sorted(PurePosixPath(name).stem for name in model.names):
-        return {}
-    warn(
-        f"{model.source}: image1, image2, ... are taken for images of {some([*named])}, in this "
-        "order. If they are not, give them the cameras' names."
-    )
-    return counted
-
-
-def _source(label: str, folder: Path, name: Any) -> Path:
-    """The video or the folder of images that a frame names."""
-    for source in paths_inside(label, folder, name, "file_path", "cam00.mp4"):
-        if source.is_dir() or (source.is_file() and source.suffix.lower() in videos.SUFFIXES):
-            break
-        if source.is_file() and source.parent != folder:
-            return source.parent
-    else:
-        raise SceneError(
-            f"{label}: {folder / name} is not a video ({', '.join(videos.SUFFIXES)}), a folder "
-            "of images or an image in a folder of one camera. Add it, or remove the frame from "
-            "the list."
-        )
-    if source == folder:
-        raise SceneError(f"{label}: file_path is the scene's folder, not that of one camera.")
-    return source
 
 
 def _split_cameras(
@@ -538,7 +223,7 @@ def _recording(camera: Camera) -> Recording:
     """The frames of a camera, read from headers only."""
     if camera.source.is_file():
         return Recording(camera, *videos.read_header(camera.source))
-    images = _images_in(camera.source)
+    images = images_in(camera.source)
     if not images:
         raise SceneError(
             f"{camera.source} holds no images ({', '.join(ENDINGS)}), nor does a folder in it. Add "
@@ -552,17 +237,6 @@ def _recording(camera: Camera) -> Recording:
                 f"{sizes[0][1]}x{sizes[0][0]}. Export its frames alike."
             )
     return Recording(camera, sizes[0], len(images), None, images=tuple(images))
-
-
-def _images_in(folder: Path) -> list[Path]:
-    """Images of a folder, or of its only subfolder, in the order of the numbers in their names."""
-    inside = sorted(folder.iterdir(), key=lambda path: natural(path.name))
-    if found := [path for path in inside if is_image(path)]:
-        return found
-    folders = [path for path in inside if path.is_dir() and path.name[0] != "."]
-    named = [path for path in folders if path.name.lower() in IMAGES]
-    folders = named if len(folders) > 1 else folders
-    return _images_in(folders[0]) if len(folders) == 1 else []
 
 
 def _are_stamped(recordings: Sequence[Recording]) -> bool:

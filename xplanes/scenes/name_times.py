@@ -133,12 +133,14 @@ def _most_different(texts: Sequence[str]) -> list[Number]:
         return []
     shared = range(min(map(len, rows)))
     place = max(shared, key=lambda column: (len({row[column] for row in rows}), column))
-    # The first of several may have no number, or 0.
-    copies = [int(match[1]) if (match := COPY.search(text)) else -1 for text in texts]
-    varying = [int(row[place]) for row in rows], [int(row[-1]) for row in rows], copies
-    kinds = [len(set(numbers)) for numbers in varying[:2]]
-    found = varying[2] if max(kinds) == 1 else varying[kinds.index(max(kinds))]
-    return list(found)
+    found: list[Number] = [int(row[place]) for row in rows]
+    last: list[Number] = [int(row[-1]) for row in rows]
+    if len(set(last)) > len(set(found)):
+        found = last
+    if len(set(found)) > 1 or not any(map(COPY.search, texts)):
+        return found
+    # The first of several copies may have no number, or 0.
+    return [int(match[1]) if (match := COPY.search(text)) else -1 for text in texts]
 
 
 def _no_series(names: Sequence[str], stems: Sequence[str], found: Sequence[Number]) -> str | None:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from xplanes.errors import BrokenFrameError, SceneError, first_of, warn
 from xplanes.scenes.entries import image_path, short, spelt
 from xplanes.scenes.listing import Listing, held_out
-from xplanes.scenes.multicamera import is_rig
+from xplanes.scenes.rigs import is_rig
 from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.transforms import listing_of, read_frames, stated_up
 from xplanes.scenes.views import Scene

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
+from unittest.mock import Mock, patch
 
 import lightning
 import pytest
@@ -168,6 +169,20 @@ def test_what_a_step_shows_is_read_now_and_then(fake_gpu):
     assert 17 * 128 < seen["rays"] + seen["no_room"] <= 17 * 256
     assert 0 < module.tally.last["psnr"] < 40
     assert 0 < module.tally.last["foreground"] < 1
+
+
+def test_slots_are_those_of_the_next_batch():
+    module = RadianceModule.compose("lrm=none", "model.rays.samples_per_batch=8192")
+    module.build(ball_scene())
+    module._trainer = Mock()
+    module.rays = 64
+    with (
+        patch.object(module.tally, "read", return_value=(64, 64 * 16)),
+        patch.object(module.sampler, "expect") as expected,
+    ):
+        module._read_tally()
+    assert module.rays == 512
+    expected.assert_called_once_with(512 * 16)
 
 
 @dataclass(frozen=True, kw_only=True)

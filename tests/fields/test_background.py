@@ -12,6 +12,7 @@ import yaml
 from xplanes.baselines.kplanes.field import contract_cube
 from xplanes.config import CONF
 from xplanes.fields.background import Background, contract
+from xplanes.models import background as module
 from xplanes.models.background import BackgroundSettings, weighted_median
 from xplanes.rendering.behind import background_colour, behind
 from xplanes.streams import Stream, TrainingState, initial_values
@@ -192,7 +193,7 @@ def shown_elsewhere(weight):
     bright, other = directions[:, 1] > 0.9, directions[:, 0] < -0.9
     seen = bright | (directions[:, 2] > 0.8)
     rays = {"target": 0.8 * bright[seen, None].float().expand(-1, 3)}
-    rendering: Any = SimpleNamespace(opacity=torch.zeros(len(rays["target"])))
+    rendering: Any = SimpleNamespace(opacity=torch.zeros(len(rays["target"])), shown=None)
     optimizer = optimizer_of(background)
     for step in range(160):
         optimizer.zero_grad()
@@ -204,6 +205,26 @@ def shown_elsewhere(weight):
     assert error < 1e-3, "what is seen does not give way"
     with torch.no_grad():
         return float(background_colour(background, origins[other], directions[other]).mean())
+
+
+@pytest.mark.parametrize(
+    ("opacity", "shown", "usual"),
+    [
+        ([0.0, 0.0, 1.0, 1.0, 1.0], None, 0.2),
+        ([0.0, 0.0, 0.0, 0.0, 0.0], [True, True, False, False, False], 0.2),
+        ([1.0, 1.0, 1.0, 1.0, 1.0], None, 0.5),  # No ray passes.
+    ],
+)
+def test_the_usual_colour_is_that_of_rays_that_pass(monkeypatch, opacity, shown, usual):
+    monkeypatch.setattr(module, "background_colour", lambda _, origins, __: 0 * origins)
+    known = yaml.safe_load((CONF / "model" / "six_planes.yaml").read_text())["background"]
+    settings = BackgroundSettings(**known)
+    seen = None if shown is None else torch.tensor(shown)
+    rendering: Any = SimpleNamespace(opacity=torch.tensor(opacity), shown=seen)
+    rays = {"target": torch.tensor([0.2, 0.2, 0.5, 0.8, 0.9])[:, None].expand(-1, 3)}
+    terms = settings.losses(None, rendering, rays, TrainingState(0, 0, 0, 0))  # type: ignore[arg-type]
+    scale = module.UNSEEN_EVERY * settings.unseen
+    assert float(terms["unseen"]) == pytest.approx(scale * usual**2)
 
 
 def test_directions_that_no_view_shows_get_the_usual_colour():

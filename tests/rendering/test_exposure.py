@@ -1,6 +1,8 @@
 """Exposures of cameras: gains that are learnt, used in training alone, and stored."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -28,10 +30,11 @@ class Painted(Sampler):
 
     def __init__(self) -> None:
         self.colour = torch.full((4, 3), 0.5, requires_grad=True)
+        self.samples: Any = None
 
     def render(self, field, rays, state):
         nothing = torch.zeros(4)
-        return Rendering(self.colour, nothing, nothing, nothing, None)  # type: ignore[arg-type]
+        return Rendering(self.colour, nothing, nothing, nothing, self.samples)  # type: ignore[arg-type]
 
 
 def test_gains_of_cameras_are_found_and_their_mean_is_one():
@@ -56,6 +59,15 @@ def test_gains_of_cameras_are_found_and_their_mean_is_one():
     torch.testing.assert_close(inner.colour, true.expand(4, 3), rtol=0, atol=0.01)
     spread = GAINS.log().square().mean().sqrt()
     assert sampler.scalars()["sampler/exposures_spread"] == pytest.approx(float(spread), abs=0.01)
+
+
+def test_gains_learn_nothing_from_rays_that_were_left_out():
+    inner = Painted()
+    inner.samples = SimpleNamespace(shown=torch.tensor([True, False, False, True]))
+    sampler = ExposureSampler(inner, CAMERAS, start=0)
+    rays = {"view": torch.arange(4)}
+    sampler.render(None, rays, TrainingState(0, 0, 0, 0)).colour[1:3].sum().backward()
+    assert not sampler.exposures.logarithms.grad.any()
 
 
 @pytest.mark.parametrize(

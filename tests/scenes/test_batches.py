@@ -221,6 +221,8 @@ def test_batches_of_open_size_follow_the_device():
     large = left_open.on(gpu)
     assert (large.per_batch, large.samples_per_batch) == (32768, 524288)
     assert (large.fitting(256, 4096), left_open.fitting(256, 4096)) == (32768, 512)
+    few = replace(left_open, per_batch=16)
+    assert (few.fitting(16, 160), left_open.fitting(100, 10**6)) == (16, 64)
     assert RAYS.on(gpu) == RAYS
     one_given = replace(left_open, per_batch=2048).on(gpu)
     assert (one_given.per_batch, one_given.samples_per_batch) == (2048, 524288)

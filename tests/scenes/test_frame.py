@@ -9,7 +9,15 @@ import torch
 from tests.balls import ball_views, inside_ball, swinging
 from xplanes.errors import SceneError
 from xplanes.scenes.cameras import look_at, orbit
-from xplanes.scenes.frame import CubeHints, Frame, _reach, cube_frame, optical_centre, scene_frame
+from xplanes.scenes.frame import (
+    CubeHints,
+    Frame,
+    _reach,
+    cube_frame,
+    optical_centre,
+    pixels_across,
+    scene_frame,
+)
 from xplanes.scenes.lenses import Lenses, LensModel
 from xplanes.scenes.views import Intrinsics, Views
 
@@ -91,8 +99,13 @@ def test_cameras_that_look_away_from_one_another_are_refused_with_a_way_out():
     poses = orbit(6, radius=2.0, elevation=0.0)
     poses[:, :3, 0] *= -1
     poses[:, :3, 2] *= -1  # turned about: they look outwards
-    with pytest.raises(SceneError, match=r"data\.half_side"):
+    with pytest.raises(SceneError, match=r"data\.half_side and data\.centre"):
         scene_frame(views_of(poses))
+
+
+def test_a_camera_at_the_centre_sees_a_finite_number_of_pixels():
+    views = views_of(torch.eye(4)[None])
+    assert 0 < pixels_across(views, cube_frame(5.0, torch.zeros(3))) < 1000
 
 
 def test_images_of_nothing_leave_the_cameras_cube():

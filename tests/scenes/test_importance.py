@@ -165,3 +165,8 @@ def test_a_map_continues_from_a_checkpoint_to_the_same_bits(errors):
             observe(again, tile, error)
             assert torch.equal(errors.errors, again.errors)
     assert torch.equal(errors.state_dict()["sums"], again.state_dict()["sums"])
+    # What one process alone has observed counts once.
+    again.drop_own()
+    assert torch.equal(errors.state_dict()["sums"][0], again.state_dict()["sums"][0])
+    assert errors.state_dict()["sums"][1].any()
+    assert not again.state_dict()["sums"][1].any()

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.balls import ball_views, swinging
+from tests.balls import ball_scene, ball_views, swinging
 from tests.training.runs import UNSCORED, changed, checkpoint, same_state, small_config
 from xplanes.models import x_planes
 from xplanes.models.initialisation import Method
@@ -43,6 +43,11 @@ def test_they_may_be_given_or_left_out():
     assert settings("model.fine.texels=100").fine_texels(0) == 100
     assert settings("model.fine=null").fine_texels(4000) == 0
     assert changed(("recipe=paper",))["model"]["fine"] is None
+    # No finer than twice the space planes, or with more channels than they have.
+    assert settings("model.resolution=200").fine_texels(4000) == 0
+    module = RadianceModule.compose("lrm=none", "model.channels=4", "model.fine.texels=32")
+    module.build(ball_scene())
+    assert module.field.fine.shape[-1] == 4 < module.parts.settings.fine.channels
 
 
 def test_they_are_zero_until_their_first_step_and_go_on_exactly(train):

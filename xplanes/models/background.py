@@ -93,7 +93,10 @@ class BackgroundSettings(Settings):
         """
         if not self.unseen or state.step % UNSEEN_EVERY:
             return {}
-        behind = (1 - rendering.opacity.detach()) * rays.get("weight", 1)
+        # Equal weights where no ray passes.
+        behind = (1 - rendering.opacity.detach()).clamp_min(1e-6) * rays.get("weight", 1)
+        if rendering.shown is not None:
+            behind = behind * rendering.shown
         usual = weighted_median(rays["target"], behind)
         generator = state.generator(usual.device, Stream.UNSEEN)
         options = {"generator": generator, "device": usual.device}

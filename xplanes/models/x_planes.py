@@ -32,6 +32,7 @@ from xplanes.models.base import (
     background_opacity,
     opacity_error,
     opacity_shortfall,
+    ray_mean,
     warm_cosine,
 )
 from xplanes.rendering.base import Rendering
@@ -74,7 +75,7 @@ class FineSettings(Settings):
     # Texels along each space axis. auto: two per three image pixels across the field's cube; no
     # fine planes for moving scenes with surroundings.
     texels: Count | Literal["auto"]
-    channels: Count  # Channels of each plane.
+    channels: Count  # Channels of each plane, at most `model.channels`.
     start: Steps  # Step from which they are trained.
     total_variation: Weight  # Weight of their total variation.
     coarse_variation: Weight  # Replaces `model.loss.total_variation` where there are fine planes.
@@ -178,8 +179,8 @@ class XPlanesSettings(ModelSettings):
         """
         if self.fine is None or self.fine.texels != "auto":
             return 0 if self.fine is None else int(self.fine.texels)
-        texels = TEXEL_STEP * round(TEXELS_PER_PIXEL * pixels / TEXEL_STEP)
-        return 0 if texels < FINER * self.resolution else min(texels, MOST_TEXELS)
+        texels = min(TEXEL_STEP * round(TEXELS_PER_PIXEL * pixels / TEXEL_STEP), MOST_TEXELS)
+        return 0 if texels < FINER * self.resolution else texels
 
     def rows_of_time(self, times: Tensor, frames: int = 0) -> int:
         """Rows of the time planes.
@@ -221,7 +222,7 @@ class XPlanesSettings(ModelSettings):
         else:
             planes = self.random_planes(plane_set, self.rows_of_time(site.times), generator)
         if self.fine is not None and (texels := self.fine_texels(site.pixels)):
-            zeros = torch.zeros(self.fine.channels, texels, texels)
+            zeros = torch.zeros(min(self.fine.channels, self.channels), texels, texels)
             planes = {**planes, **dict.fromkeys(FINE_PLANES, zeros)}
         options = self.decoder
         with initial_values(site.seed, Stream.INITIAL_FIELD):
@@ -333,7 +334,7 @@ class XPlanesModel(Model):
     def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         terms = super().losses(rendering, rays, state)
         if weight := self._passing(state.step):
-            terms["passing"] = weight * (1 - rendering.opacity).mean()
+            terms["passing"] = weight * ray_mean(1 - rendering.opacity, rays)
         if (background := self._field.background) is not None:
             if (options := self.settings.background) is not None:
                 terms |= options.losses(background, rendering, rays, state)

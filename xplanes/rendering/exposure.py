@@ -53,7 +53,11 @@ class ExposureSampler(WrappingSampler):
         rendering = self.inner.render(field, rays, state)
         if state.step < self.start:
             return rendering
-        return replace(rendering, colour=rendering.colour * self.exposures(rays["view"]))
+        gains = self.exposures(rays["view"])
+        if (shown := rendering.shown) is not None:
+            # The colour of a ray without slots is that of the background alone.
+            gains = torch.where(shown[:, None], gains, gains.detach())
+        return replace(rendering, colour=rendering.colour * gains)
 
     def losses(self, rendering: Any) -> dict[str, Tensor]:
         pull = PULL * self.exposures.relative.square().mean()

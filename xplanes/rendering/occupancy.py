@@ -169,7 +169,7 @@ class OccupancyGrid(nn.Module):
             seen.view(1, self.time_bins, size, size, size), 3, stride=1, padding=1
         )
         keep = self.occupied & (around.view(-1) > self.empty_density)
-        # A cell kept because of a neighbour is emptied unless the next observation finds density.
+        # A cell kept because of a neighbour is emptied if two observations find no density there.
         floor = self.empty_density / max(self.decay, 1e-3) * 1.001
         kept = seen.clamp_min(floor)
         lost = self.density.clamp_max(0.5 * self.empty_density)
@@ -275,8 +275,8 @@ class OccupancyGrid(nn.Module):
         return found
 
     def _usable(self, density: Tensor) -> Tensor:
-        """Densities clamped to ``opaque_density``, so that cells can decay; NaN becomes 0."""
-        return density.float().nan_to_num(0.0).clamp_max(self.opaque_density)
+        """Densities clamped to [0, ``opaque_density``], so that cells can decay; NaN becomes 0."""
+        return density.float().nan_to_num(0.0).clamp(0, self.opaque_density)
 
     def draw(self, cells: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Points and times in cells from uniform numbers. [N], [N, 4] -> [N, 3], [N]"""

@@ -43,6 +43,9 @@ LARGEST_SHARE = 0.25
 AHEAD = 8
 """Number of batches whose pixels are prefetched from the disk."""
 
+FEWEST_RAYS = 64
+"""Fewest rays of a batch, unless per_batch is lower."""
+
 CPU_RAYS, CPU_SAMPLES = 1365, 8192
 """Largest batch on the CPU with per_batch=auto; schedules in steps assume this size."""
 
@@ -134,7 +137,8 @@ class RaySettings(BatchSettings):
     # Maximum rays per batch. auto: 1365 on the CPU; 32768 on a GPU, where most schedules in steps
     # are shortened to 1/24.
     per_batch: Count | Literal["auto"]
-    # Maximum samples per batch, on average. auto: 8192 on the CPU, 524288 on a GPU.
+    # Maximum samples per batch, on average; 64 rays may exceed it. auto: 8192 on the CPU, 524288 on
+    # a GPU.
     samples_per_batch: Count | Literal["auto"]
     # Background colour. random: drawn per ray; one: drawn per batch.
     background: Literal["white", "random", "one"]
@@ -142,7 +146,7 @@ class RaySettings(BatchSettings):
     background_share: Share  # Share of rays far from silhouettes.
     background_jitter: Share  # Maximum random time offset of these rays.
     # Share of rays that are drawn in proportion to the error of the field where their pixels lie.
-    # Weights in the loss make up for it. For images in memory; 0: none.
+    # Weights in the losses of colour and opacity make up for it. For images in memory; 0: none.
     error_share: Share
     # Learn a gain per colour channel of each training camera, if the images show surroundings.
     match_exposure: bool
@@ -172,7 +176,7 @@ class RaySettings(BatchSettings):
     def fitting(self, rays: int, samples: int) -> int:
         """Number of rays that keeps the number of samples near its maximum."""
         room = self.most_samples * rays / max(1, samples)
-        return max(64, min(self.most, int(room)))
+        return min(self.most, max(FEWEST_RAYS, int(room)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -235,8 +235,8 @@ def scene_frame(views: Views, hints: CubeHints = NO_HINTS) -> Frame:
         raise SceneError(
             "the cameras look away from one another, so the scene's bounds cannot be found. Axes "
             "are OpenGL's: where those of the file are OpenCV's (y down, z forward), negate the "
-            "second and third column of every pose. If the poses are right, set data.half_side, in "
-            "world units"
+            "second and third column of every pose. If the poses are right, set data.half_side "
+            "and data.centre, in world units"
         )
     if seen is not None:
         reach = (seen - centre).abs().max()
@@ -255,6 +255,8 @@ def pixels_across(views: Views, frame: Frame) -> float:
         frame: The field's frame.
     """
     distance = (views.camera_to_world[:, :3, 3] - frame.centre).double().norm(dim=-1)
+    # A camera near the centre sees the content of the cube around itself.
+    distance = distance.clamp_min(0.5 / frame.scale)
     pixel = distance / views.intrinsics.pinhole.amax(dim=1)
     return float((2 / frame.scale / pixel).median())
 

@@ -129,6 +129,10 @@ class ErrorMap:
             fresh.zero_()
             self.errors = self._errors()
 
+    def drop_own(self) -> None:
+        """Forget what only this process has observed since the last update."""
+        self._sums[1:].zero_()
+
     def _errors(self) -> Tensor | None:
         if self.batches - self.batches % REFRESH < max(self.start, 1):
             return None

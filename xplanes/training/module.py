@@ -294,6 +294,7 @@ class RadianceModule(ViewScoring):
             for part in self.shared_parts:
                 for name in getattr(part, "own", ()):
                     getattr(part, name).zero_()
+            self.error_map.drop_own()
 
     @property
     def _optimizer(self) -> torch.optim.Optimizer:
@@ -380,10 +381,10 @@ class RadianceModule(ViewScoring):
         if (found := self.tally.read(self.trainer)) is None:
             return
         rays, samples = found
-        # Expected number of samples in the next batch.
-        self.sampler.expect(samples * self.rays / max(1, rays))
         if self.rays:
             self.rays = self.ray_settings.fitting(rays, samples)
+        # Expected number of samples in the next batch.
+        self.sampler.expect(samples * self.rays / max(1, rays))
 
     def _give_up(self, unusable: Sequence[str] = ()) -> None:
         assert self._seen is not None

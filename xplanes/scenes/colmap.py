@@ -36,13 +36,7 @@ from xplanes.scenes.entries import (
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import Listing, held_out, time_source
 from xplanes.scenes.name_times import OTHER_TIMES, times_in_names
-from xplanes.scenes.rigs import (
-    POSES,
-    STATIC,
-    are_registered,
-    is_dynamic,
-    recordings_of_cameras,
-)
+from xplanes.scenes.rigs import POSES, STATIC, are_registered, is_dynamic, recordings_of_cameras
 from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.views import Scene
 from xplanes.settings import Location

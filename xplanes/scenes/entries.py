@@ -9,7 +9,7 @@ import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import lru_cache
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PureWindowsPath
 from typing import Any, TypeGuard, TypeVar
 from urllib.parse import unquote
 
@@ -70,24 +70,15 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         BrokenFrameError: If there is no such file, or it is empty.
         SceneError: If it is not a name, or leaves the folder.
     """
-    choices = []
-    for image in paths_inside(label, folder, name, key, "./train/r_000"):
-        if image.is_file():
-            return _with_content(label, image)
-        choices.append(image)
-    inside = [folder / "images" / path.name for path in choices if path.parent == folder]
-    for image in inside:
-        if image.is_file():
-            return _with_content(label, image)
-    choices += inside
-    for image in choices:
-        if (parent := _like(image.parent)) is None:
-            continue
-        wanted = image.stem if image.suffix.lower() in ENDINGS else image.name
-        found = _stems(parent).get(_normalised(wanted), ())
-        same = [path for path in found if _normalised(path.name) == _normalised(image.name)]
-        if len(chosen := same or found) == 1:
-            return _with_content(label, chosen[0])
+    choices = [*paths_inside(label, folder, name, key, "./train/r_000")]
+    choices += [folder / "images" / path.name for path in choices if path.parent == folder]
+    image = next(filter(Path.is_file, choices), None)
+    if image is None:
+        image = next(filter(None, map(_similar, choices)), None)
+    if image is not None:
+        if image.stat().st_size == 0:
+            raise BrokenFrameError(f"{label}: {image} holds 0 bytes. Copy the file again.")
+        return image
     if (plain := unquote(name)) != name:  # Percent-encoded, as in URLs.
         return image_path(label, folder, plain, key)
     if Path(name).is_absolute() and Path(name).is_file():
@@ -99,12 +90,6 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         f"{label}: no image {folder / name}, nor with {', '.join(SUFFIXES[1:4])}, ... added. "
         f"Add the file or take the frame out of the list."
     )
-
-
-def _with_content(label: str, image: Path) -> Path:
-    if image.stat().st_size == 0:
-        raise BrokenFrameError(f"{label}: {image} holds 0 bytes. Copy the file again.")
-    return image
 
 
 def usable(
@@ -171,6 +156,19 @@ def _like(folder: Path) -> Path | None:
     return names[0] if len(names) == 1 and names[0].is_dir() else None
 
 
+def _similar(image: Path) -> Path | None:
+    """An image, or else the only one whose name differs in case, accents or format alone."""
+    if image.is_file():
+        return image
+    if (parent := _like(image.parent)) is None:
+        return None
+    wanted = image.stem if image.suffix.lower() in ENDINGS else image.name
+    found = _stems(parent).get(_normalised(wanted), [])
+    same = [path for path in found if _normalised(path.name) == _normalised(image.name)]
+    chosen = same or found
+    return chosen[0] if len(chosen) == 1 else None
+
+
 def spelt(name: Any) -> str:
     """A name in one spelling: with slashes, and without . and .. where they change nothing."""
     return os.path.normpath(str(name).replace("\\", "/"))
@@ -227,24 +225,16 @@ def mask_files(folder: Path, names: Sequence[Sequence[str]]) -> tuple[Path | Non
     Raises:
         SceneError: If no image has a mask.
     """
-    root = _like(folder)
-    masks = tuple(None if root is None else _mask(root, each) for each in names)
+    # PNG takes precedence over other endings.
+    choices = [[folder / f"{name}.png" for name in each] for each in names]
+    masks = tuple(next(filter(None, map(_similar, each)), None) for each in choices)
     if not any(masks):
+        where = "holds" if _like(folder) else "does not exist, so there is"
         raise SceneError(
-            f"data.masks: {folder} {'holds' if root else 'does not exist, so there is'} no mask of "
-            f"any image, such as {names[0][0]}.png. Put the masks there, or set data.masks=null."
+            f"data.masks: {folder} {where} no mask of any image, such as {names[0][0]}.png. Put "
+            "the masks there, or set data.masks=null."
         )
     return masks
-
-
-def _mask(root: Path, names: Sequence[str]) -> Path | None:
-    """The mask that has one of the names; PNG takes precedence over other endings."""
-    for name in names:
-        if (parent := _like((root / name).parent)) is not None:
-            found = _stems(parent).get(_normalised(PurePosixPath(name).name), [])
-            if len(chosen := [path for path in found if path.suffix == ".png"] or found) == 1:
-                return chosen[0]
-    return None
 
 
 def unit_times(times: Sequence[float], span: tuple[float, float] | None = None) -> list[float]:
@@ -424,36 +414,15 @@ def world_turn(
     return None, f"the z axis of the files; the cameras' mean up vector is {off:.3g} degrees off"
 
 
-def require_precision(source: Path, positions: np.ndarray) -> None:
-    """Refuse cameras so far from the world's origin that single precision changes their poses.
-
-    Args:
-        source: File of the cameras, for messages.
-        positions: Positions of all cameras of a capture. float64 [V, 3]
-
-    Raises:
-        SceneError: If they are too far away.
-    """
-    extent = float(np.ptp(positions, axis=0).max())
-    largest = float(np.abs(positions).max())
-    fixed = extent <= SAME_PLACE
-    room = FARTHEST if fixed else ROUNDING * extent / float(np.finfo(np.float32).eps)
-    if not largest <= min(room, FARTHEST):
-        raise SceneError(
-            f"{source}: the cameras lie up to {largest:.3g} world units from the origin and "
-            f"{extent:.3g} apart, which single precision cannot resolve. Subtract the same vector "
-            "from the positions of all cameras, as colmap model_transformer does, or correct them."
-        )
-
-
-def origin_near(source: Path, positions: np.ndarray) -> np.ndarray:
+def origin_near(source: Path, positions: np.ndarray, movable: bool = True) -> np.ndarray:
     """A point relative to which single precision resolves the cameras: if possible, the origin.
 
     Captures in map coordinates lie millions of metres away, where numbers are half a metre apart.
 
     Args:
-        source: As for `require_precision`.
-        positions: As for `require_precision`.
+        source: File of the cameras, for messages.
+        positions: Positions of all cameras of a capture. float64 [V, 3]
+        movable: Whether it may be another point than the origin.
 
     Returns:
         float64 [3]
@@ -461,12 +430,21 @@ def origin_near(source: Path, positions: np.ndarray) -> np.ndarray:
     Raises:
         SceneError: If there is no such point.
     """
+    extent = float(np.ptp(positions, axis=0).max())
+    fixed = extent <= SAME_PLACE
+    room = FARTHEST if fixed else ROUNDING * extent / float(np.finfo(np.float32).eps)
     origin = np.zeros(3)
-    try:
-        require_precision(source, positions)
-    except SceneError:
+    largest = float(np.abs(positions).max())
+    if movable and not largest <= min(room, FARTHEST):
         origin = positions.mean(axis=0).round()
-        require_precision(source, positions - origin)
+        largest = float(np.abs(positions - origin).max())
+    if not largest <= min(room, FARTHEST):
+        raise SceneError(
+            f"{source}: the cameras lie up to {largest:.3g} world units from the origin and "
+            f"{extent:.3g} apart, which single precision cannot resolve. Subtract the same vector "
+            "from the positions of all cameras, as colmap model_transformer does, or correct them."
+        )
+    if origin.any():
         x, y, z = origin.tolist()
         warn(
             f"{source}: the origin is far away, so positions are read relative to "

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from xplanes.errors import MissingSplitError, SceneError, refuse_all, warn
-from xplanes.scenes.entries import origin_near, refuse_repeats, require_precision, some
+from xplanes.scenes.entries import origin_near, refuse_repeats, some
 from xplanes.scenes.formats import UNTURN, mask_misfit, orientation
 from xplanes.scenes.images import GREY, Size, final_sizes, native_sizes, read_images
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
@@ -159,13 +159,8 @@ class Listing:
             SceneError: If cameras are too far away, an image is listed twice, or the sizes of files
                 and calibrations do not match.
         """
-        positions, origin = poses[:, :3, 3], np.zeros(3)
-        if movable:
-            origin = origin_near(source, positions)
-            poses = poses.copy()
-            poses[:, :3, 3] = positions - origin
-        else:
-            require_precision(source, positions)
+        origin, poses = origin_near(source, poses[:, :3, 3], movable), poses.copy()
+        poses[:, :3, 3] -= origin
         refuse_repeats(labels, paths, poses, times)
         listing = cls(
             paths=tuple(paths),

@@ -14,12 +14,7 @@ from torch import Tensor
 from xplanes.errors import ConfigError, MissingSplitError, SceneError, refuse_all, warn
 from xplanes.files import natural
 from xplanes.scenes import store, videos
-from xplanes.scenes.entries import (
-    origin_near,
-    some,
-    unit_times,
-    world_turn,
-)
+from xplanes.scenes.entries import origin_near, some, unit_times, world_turn
 from xplanes.scenes.formats import ENDINGS, read_header
 from xplanes.scenes.images import (
     Size,
@@ -42,9 +37,7 @@ from xplanes.scenes.rigs import (
     recordings_below,
 )
 from xplanes.scenes.source import SceneSettings
-from xplanes.scenes.transforms import (
-    stated_up,
-)
+from xplanes.scenes.transforms import stated_up
 from xplanes.scenes.views import Scene, Views
 
 logger = logging.getLogger(__name__)

@@ -18,21 +18,10 @@ from xplanes.errors import SceneError, warn
 from xplanes.files import natural
 from xplanes.scenes import videos
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, image_count, read_model
-from xplanes.scenes.entries import (
-    checked_pose,
-    is_positive,
-    paths_inside,
-    require_fetched,
-    some,
-)
+from xplanes.scenes.entries import checked_pose, is_positive, paths_inside, require_fetched, some
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import Calibration
-from xplanes.scenes.transforms import (
-    TRANSPARENT,
-    read_calibration,
-    read_frames,
-    warn_of_unknown,
-)
+from xplanes.scenes.transforms import TRANSPARENT, read_calibration, read_frames, warn_of_unknown
 
 POSES = "poses_bounds.npy"
 TRANSFORMS = "transforms.json"

@@ -23,7 +23,7 @@ from xplanes.files import DAY, MARK, StorageError
 from xplanes.scenes import store
 from xplanes.scenes.batches import AHEAD, RayBatches
 from xplanes.scenes.frame import cube_frame, scene_frame
-from xplanes.scenes.images import final_sizes, native_sizes
+from xplanes.scenes.images import Picture, final_sizes, native_sizes
 from xplanes.scenes.images import read_images as read_sized
 from xplanes.scenes.lenses import Lenses, LensModel
 from xplanes.scenes.matte import silhouette_of
@@ -48,7 +48,7 @@ def pictures(folder: Path, sizes, *, alpha: bool) -> list[Path]:
 def read_images(paths: list[Path], resolution: int | None = None, cache: Path | None = None):
     native = native_sizes(paths)
     sizes = final_sizes(paths, native, resolution)
-    return read_sized(paths, sizes, cache=cache), native, sizes
+    return read_sized([*map(Picture, paths, sizes)], cache), native, sizes
 
 
 @pytest.fixture

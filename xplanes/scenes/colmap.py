@@ -139,10 +139,12 @@ class ColmapSettings(CaptureSettings):
         images = _image_folder(self.folder, self.images, model)
         root = images.resolve()
 
-        def image_of(name: str) -> Path:
-            return image_path(f"{model.source}: {name}", root, name, "NAME")
+        def image_of(place: int) -> tuple[int, Path]:
+            name = model.names[place]
+            return place, image_path(f"{model.source}: {name}", root, name, "NAME")
 
-        kept, paths = zip(*usable("images", image_of, model.names), strict=True)
+        places = range(len(model.names))
+        kept, paths = zip(*usable("images", image_of, places), strict=True)
         model = model.subset(kept)
         labels = [f"{model.source}: {name}" for name in model.names]
         # The search does not enter folders that are links.

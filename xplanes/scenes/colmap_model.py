@@ -141,8 +141,7 @@ def read_model(folder: Path) -> SparseModel:
             f"{images_path} lists no images: COLMAP has registered none. Run its mapper again, or "
             "choose another model."
         )
-    posed = usable("images", lambda image: _pose(image[2], image[3]), images)
-    images = [(*images[place][:2], pose) for place, pose in posed]
+    images = usable("images", lambda image: (*image[:2], _pose(*image[2:])), images)
     for (name, *_), (after, *_) in pairwise(images):
         if name == after:
             raise SceneError(f"{images_path} lists {name} twice. Remove one of the two.")

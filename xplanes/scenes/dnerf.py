@@ -67,7 +67,7 @@ def read_scene(settings: SceneSettings, splits: Sequence[str], mask_use: MaskUse
     _warn_of_shared_files(folder, listed)
     listed = settings.thinned(listed)
     video = _list_video(folder, span)
-    _require_times(folder, listed, video)
+    _require_times(folder, listed if video is None else {**listed, "video": video})
     # Masks mean the same whichever parts are read.
     return settings.scene_of(listed, mask_use, all_masks(contents), video=video)
 
@@ -98,14 +98,13 @@ def _warn_of_shared_files(folder: Path, parts: Mapping[str, Listing]) -> None:
             )
 
 
-def _require_times(folder: Path, parts: Mapping[str, Listing], video: Listing | None) -> None:
+def _require_times(folder: Path, parts: Mapping[str, Listing]) -> None:
     """Refuse splits and videos of a dynamic scene that have no times."""
     train = parts.get("train")
     if train is None or len(train.times.unique()) == 1:
         return
-    others = parts if video is None else {**parts, "video": video}
-    for split, listing in others.items():
-        if not listing.timed:
+    for split, listing in parts.items():
+        if not listing.time_source:
             raise SceneError(
                 f'No frame of {folder / f"transforms_{split}.json"} has a "time", but those of '
                 "transforms_train.json have several. Give every frame its time."

@@ -92,10 +92,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
     )
 
 
-def usable(
-    what: str, read: Callable[[Item], Found], items: Sequence[Item]
-) -> list[tuple[int, Found]]:
-    """Results of a function for usable frames, with their indices; warns about the others.
+def usable(what: str, read: Callable[[Item], Found], items: Sequence[Item]) -> list[Found]:
+    """Results of a function for usable frames; warns about the others.
 
     Args:
         what: Name of the frames, for the warning.
@@ -106,11 +104,11 @@ def usable(
         MissingSplitError: If all frames are left out.
         SceneError: If ``read`` raises other errors; the message has all of them.
     """
-    found: list[tuple[int, Found]] = []
+    found: list[Found] = []
     left_out, wrong = [], []
-    for place, item in enumerate(items):
+    for item in items:
         try:
-            found.append((place, read(item)))
+            found.append(read(item))
         except BrokenFrameError as problem:
             left_out.append(str(problem))
         except SceneError as problem:

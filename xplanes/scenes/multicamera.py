@@ -17,12 +17,12 @@ from xplanes.scenes import store, videos
 from xplanes.scenes.entries import origin_near, some, unit_times, world_turn
 from xplanes.scenes.formats import ENDINGS, read_header
 from xplanes.scenes.images import (
+    Picture,
     Size,
     cleared,
     digests,
     final_sizes,
-    native_sizes,
-    read_image,
+    shared_size,
     shrink,
 )
 from xplanes.scenes.listing import final_intrinsics, misshapen
@@ -222,14 +222,9 @@ def _recording(camera: Camera) -> Recording:
             f"{camera.source} holds no images ({', '.join(ENDINGS)}), nor does a folder in it. Add "
             f"the frames of the camera, or take it out of the calibration ({camera.label})."
         )
-    sizes = native_sizes(images)
-    for path, size in zip(images, sizes, strict=True):
-        if size != sizes[0]:
-            raise SceneError(
-                f"{path} has {size[1]}x{size[0]} pixels, but {images[0]} of the same camera has "
-                f"{sizes[0][1]}x{sizes[0][0]}. Export its frames alike."
-            )
-    return Recording(camera, sizes[0], len(images), None, images=tuple(images))
+    first = f"{images[0]} of the same camera"
+    size = shared_size(images, first, "Export its frames alike.")
+    return Recording(camera, size, len(images), None, images=tuple(images))
 
 
 def _are_stamped(recordings: Sequence[Recording]) -> bool:
@@ -409,20 +404,15 @@ def _job(
 
     def decode() -> Iterator[tuple[int, np.ndarray]]:
         if recording.images:
-            pictures = (read_image(recording.images[number], size) for number in numbers)
-        else:
-            video = videos.frames(recording.camera.source, numbers)
-            pictures = (_reduced(frame, size) for frame in video)
-        for offset, pixels in enumerate(pictures):
-            yield place + offset, cleared(pixels, shown)
+            for offset, number in enumerate(numbers):
+                picture = Picture(recording.images[number], size, has_ray=shown)
+                yield place + offset, picture.decoded()
+            return
+        for offset, frame in enumerate(videos.frames(recording.camera.source, numbers)):
+            if frame.shape[:2] != size:
+                channels = np.full((4, *frame.shape[:2]), 255, np.float32)
+                channels[:3] = frame.transpose(2, 0, 1)
+                frame = shrink(channels, size[1], size[0])
+            yield place + offset, cleared(frame, shown)
 
     return decode
-
-
-def _reduced(frame: np.ndarray, size: Size) -> np.ndarray:
-    """A video frame, reduced to its final size. uint8 [h, w, 3] -> [H, W, 3 or 4]"""
-    if frame.shape[:2] == size:
-        return frame
-    channels = np.full((4, *frame.shape[:2]), 255, np.float32)
-    channels[:3] = frame.transpose(2, 0, 1)
-    return shrink(channels, size[1], size[0])

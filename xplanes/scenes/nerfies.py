@@ -86,15 +86,15 @@ class NerfiesSettings(CaptureSettings):
         if not self.static:
             metadata = read_object(path, "the timestep of each image")
 
-        def camera_of(name: str) -> tuple[np.ndarray, Calibration]:
+        def camera_of(name: str) -> tuple[str, np.ndarray, Calibration]:
             label = str(folder / "dataset.json")
             if not self.static and not isinstance(metadata.get(name), dict):
                 raise BrokenFrameError(f"{path} has no object for {name}, such as {EXAMPLE}.")
-            return _camera(image_path(label, root, f"camera/{name}.json", "ids"))
+            return name, *_camera(image_path(label, root, f"camera/{name}.json", "ids"))
 
-        kept, cameras = zip(*usable("images", camera_of, names), strict=True)
-        names = [*map(names.__getitem__, kept)]
-        poses = np.stack([pose for pose, _ in cameras])
+        cameras = usable("images", camera_of, names)
+        names, poses, calibrations = zip(*cameras, strict=True)
+        poses = np.stack(poses)
         poses[:, :3, 3] = (poses[:, :3, 3] - centre) * scale
         points = _points(folder / "points.npy")
         if points is not None:
@@ -116,7 +116,7 @@ class NerfiesSettings(CaptureSettings):
             poses,
             times,
             files=tuple(path.relative_to(root).as_posix() for path in paths),
-            calibrations=tuple(calibration for _, calibration in cameras),
+            calibrations=calibrations,
             masks=masks,
             time_source=source,
         )

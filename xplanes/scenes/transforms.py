@@ -230,7 +230,7 @@ def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame
             )
         return _Frame(label, entry, image, mask, pose)
 
-    frames = [frame for _, frame in usable("frames", read, [*enumerate(entries)])]
+    frames = usable("frames", read, [*enumerate(entries)])
     if smaller:
         warn(
             f"{path}: {len(smaller)} of {len(entries)} images are missing and read from smaller "

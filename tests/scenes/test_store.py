@@ -96,7 +96,7 @@ def test_a_file_holds_the_pixels_of_memory(tmp_path, monkeypatch, alpha):
     for index in range(4 if alpha else 0):
         seen = silhouette_of(expected[index, : SIZES[index][0], : SIZES[index][1], 3])
         assert torch.equal(images.silhouette(index), seen), index
-    backwards = images.subset(torch.tensor([2, 0]))
+    backwards = images[torch.tensor([2, 0])]
     assert torch.equal(backwards.image(0), images.image(2))
     if hasattr(os, "pread"):  # Forked processes share the position: reading must not move it.
         assert file._file.tell() == 0

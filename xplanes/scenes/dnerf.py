@@ -6,15 +6,12 @@ from pathlib import Path
 from typing import ClassVar
 
 from xplanes.errors import MissingSplitError, SceneError, warn
-from xplanes.scenes.entries import spelt
+from xplanes.scenes.entries import SPLIT_FOLDERS, spelt
 from xplanes.scenes.listing import Listing
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.source import SceneSettings, warn_of_masks
 from xplanes.scenes.transforms import all_masks, listing_of, read_frames, readable, time_span
 from xplanes.scenes.views import Scene
-
-PARTS = ("train", "val", "test", "video")
-"""Parts that share a unit of time, and the meaning of masks: splits, and a fixed camera's video."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +58,8 @@ def read_scene(settings: SceneSettings, splits: Sequence[str], mask_use: MaskUse
     if not any(folder.glob("transforms_*.json")):
         raise settings.no_scene()
     paths = {split: _transforms_path(folder, split) for split in dict.fromkeys(splits)}
-    contents = readable([folder / f"transforms_{part}.json" for part in PARTS])
+    # All parts share a unit of time, and the meaning of masks.
+    contents = readable([folder / f"transforms_{part}.json" for part in SPLIT_FOLDERS])
     span = time_span(contents.values())
     listed = {split: _listed(split, path, span) for split, path in paths.items()}
     _warn_of_shared_files(folder, listed)

@@ -494,6 +494,25 @@ def is_number(value: Any) -> TypeGuard[float]:
         return False
 
 
+def is_positive(value: Any) -> TypeGuard[float]:
+    """Whether a value read from a file is a finite number above 0."""
+    return is_number(value) and value > 0
+
+
+def checked_number(
+    where: str | Path, key: str, value: Any, positive: bool = False, more: str = ""
+) -> float:
+    """A finite number, or one above 0, read from a file.
+
+    Raises:
+        SceneError: If it is none; ``more`` is added to the sentence.
+    """
+    if not (is_positive(value) if positive else is_number(value)):
+        above = " above 0" if positive else ""
+        raise SceneError(f"{where}: {key} is {short(value)}; it must be a number{above}{more}.")
+    return value
+
+
 def number_in(text: str) -> float | None:
     """The finite number in a string, an int if it is written as one; None for other strings."""
     for kind in (int, float):
@@ -501,11 +520,6 @@ def number_in(text: str) -> float | None:
             number = kind(text)
             return number if is_number(number) else None
     return None
-
-
-def is_positive(value: Any) -> TypeGuard[float]:
-    """Whether a value read from a file is a finite number above 0."""
-    return is_number(value) and value > 0
 
 
 def short(value: Any) -> str:

@@ -12,13 +12,7 @@ from torch import Tensor
 
 from xplanes.errors import SceneError, all_of
 from xplanes.scenes import store
-from xplanes.scenes.formats import (
-    SIXTEEN_BIT_MODES,
-    UNREADABLE,
-    open_image,
-    read_header,
-    unreadable,
-)
+from xplanes.scenes.formats import SIXTEEN_BIT_MODES, open_image, read_header
 from xplanes.scenes.masks import MaskKind, read_mask
 from xplanes.scenes.store import Size
 
@@ -211,14 +205,9 @@ def load_premultiplied(path: Path, clear: Sequence[int] = ()) -> np.ndarray:
 
     Pixels with one of the grey levels ``clear`` are transparent.
     """
-    try:
-        with open_image(path) as picture:
-            picture.load()
-            channels = _straight_channels(path, picture)
-    except SceneError:
-        raise
-    except UNREADABLE as problem:
-        raise unreadable(path, problem) from problem
+    with open_image(path) as picture:
+        picture.load()
+        channels = _straight_channels(path, picture)
     for level in clear:
         channels[3, (channels[:3] == level).all(axis=0)] = 0
     channels[:3] *= channels[3] * np.float32(1 / 255)

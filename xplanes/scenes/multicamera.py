@@ -4,6 +4,7 @@ import logging
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -198,18 +199,16 @@ def _distances(cameras: Sequence[Camera]) -> np.ndarray:
 
 def _video_camera(cameras: Sequence[Camera], parts: dict[str, list[int]], name: str | None) -> int:
     """Index of the camera whose video is the input of the LRM."""
-    train = parts["train"]
+    train = {cameras[index].name: index for index in parts["train"]}
     if name is None:
         away = _distances(cameras)
-        return min(train, key=lambda index: away[index])
-    found = [index for index, camera in enumerate(cameras) if camera.name == name]
-    if not found or found[0] not in train:
-        others = ", ".join(cameras[index].name for index in train)
+        return min(train.values(), key=lambda index: away[index])
+    if name not in train:
         raise SceneError(
             f"data.video_camera={name} is not a training camera, and the LRM must not see frames "
-            f"that are scored. Name one of {others}, or null for the most central."
+            f"that are scored. Name one of {', '.join(train)}, or null for the most central."
         )
-    return found[0]
+    return train[name]
 
 
 def _recording(camera: Camera) -> Recording:
@@ -368,7 +367,7 @@ def _read_views(
     has_ray = [intrinsics.has_ray(index) for index in range(len(recordings))]
     firsts = (counts.cumsum(0) - counts).tolist()
     jobs = [
-        _job(recording, own, size, shown, first)
+        partial(_decoded, recording, own, size, shown, first)
         for recording, own, size, shown, first in zip(
             recordings, numbers, sizes, has_ray, firsts, strict=True
         )
@@ -397,22 +396,18 @@ def _read_views(
     return views, camera
 
 
-def _job(
-    recording: Recording, numbers: range, size: Size, shown: Tensor | None, place: int
-) -> store.Job:
-    """Job that decodes the frames of a camera to the images from index ``place`` on."""
-
-    def decode() -> Iterator[tuple[int, np.ndarray]]:
-        if recording.images:
-            for offset, number in enumerate(numbers):
-                picture = Picture(recording.images[number], size, has_ray=shown)
-                yield place + offset, picture.decoded()
-            return
-        for offset, frame in enumerate(videos.frames(recording.camera.source, numbers)):
-            if frame.shape[:2] != size:
-                channels = np.full((4, *frame.shape[:2]), 255, np.float32)
-                channels[:3] = frame.transpose(2, 0, 1)
-                frame = shrink(channels, size[1], size[0])
-            yield place + offset, cleared(frame, shown)
-
-    return decode
+def _decoded(
+    recording: Recording, numbers: range, size: Size, shown: Tensor | None, first: int
+) -> Iterator[tuple[int, np.ndarray]]:
+    """The frames of a camera, decoded, and their indices, the first of which is given."""
+    if recording.images:
+        for place, number in enumerate(numbers, start=first):
+            yield place, Picture(recording.images[number], size, has_ray=shown).decoded()
+        return
+    for place, frame in enumerate(videos.frames(recording.camera.source, numbers), start=first):
+        pixels = frame
+        if frame.shape[:2] != size:
+            channels = np.full((4, *frame.shape[:2]), 255, np.float32)
+            channels[:3] = frame.transpose(2, 0, 1)
+            pixels = shrink(channels, size[1], size[0])
+        yield place, cleared(pixels, shown)

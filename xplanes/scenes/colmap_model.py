@@ -18,7 +18,7 @@ from typing import BinaryIO, TypeVar
 import numpy as np
 
 from xplanes.errors import BrokenFrameError, SceneError
-from xplanes.scenes.entries import decoded, number_in, require_fetched, short, usable
+from xplanes.scenes.entries import decoded, number_in, reading, short, usable
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
 from xplanes.scenes.listing import Calibration
 
@@ -225,12 +225,8 @@ _AGAIN = "Copy it again, or export the model again with colmap model_converter."
 
 @contextmanager
 def _binary(path: Path) -> Iterator[_Binary]:
-    require_fetched(path)
-    try:
-        with path.open("rb") as file:
-            yield _Binary(path, file)
-    except OSError as problem:
-        raise SceneError(f"{path} cannot be read ({problem}).") from problem
+    with reading(path), path.open("rb") as file:
+        yield _Binary(path, file)
 
 
 HEADER = 4096
@@ -239,11 +235,8 @@ HEADER = 4096
 
 def _text_lines(path: Path) -> Iterator[tuple[str, str]]:
     """Lines that are not comments, each with its label."""
-    require_fetched(path)
-    try:
+    with reading(path, "as text", _AGAIN):
         text = decoded(path.read_bytes())
-    except (OSError, UnicodeDecodeError) as problem:
-        raise SceneError(f"{path} cannot be read as text ({problem}). {_AGAIN}") from problem
     for number, line in enumerate(text.split("\n"), start=1):
         if not line.startswith("#"):
             yield f"{path}: line {number}", line.strip()

@@ -7,7 +7,7 @@ import os
 import re
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path, PureWindowsPath
 from typing import Any, TypeGuard, TypeVar
@@ -257,13 +257,8 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
     Raises:
         SceneError: If it cannot be read, or is not an object.
     """
-    require_fetched(path)
-    try:
+    with reading(path, "as JSON", "Export or download it again."):
         found = _parsed(_text(path))
-    except (OSError, ValueError, RecursionError) as problem:
-        raise SceneError(
-            f"{path} cannot be read as JSON ({problem}). Export or download it again."
-        ) from problem
     if not isinstance(found, dict):
         raise SceneError(f"{path} must hold a JSON object with {content}, not {short(found)}.")
     return found
@@ -296,14 +291,27 @@ def decoded(content: bytes) -> str:
     return content.decode(json.detect_encoding(content))
 
 
-def require_fetched(path: Path) -> None:
-    """Refuse a placeholder of a file that was not fetched, such as a pointer of Git LFS.
+@contextmanager
+def reading(path: Path, how: str = "", advice: str = "") -> Iterator[None]:
+    """Refuse a file that was not fetched, such as a pointer of Git LFS, or that cannot be read.
+
+    Args:
+        path: The file that is read in the block.
+        how: How it is read, such as "as JSON", for the message.
+        advice: Further text of the message.
 
     Raises:
-        SceneError: With the kind of placeholder, and how to fetch the file.
+        SceneError: With the kind of placeholder, or the problem in the block.
     """
     if (other := stand_in(path)) is not None:
         raise SceneError(f"{path} {other}.")
+    try:
+        yield
+    except SceneError:
+        raise
+    except (OSError, ValueError, EOFError, RecursionError) as problem:
+        words = " ".join(filter(None, [str(path), "cannot be read", how, f"({problem}).", advice]))
+        raise SceneError(words) from problem
 
 
 def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.ndarray:

@@ -16,7 +16,7 @@ from xplanes.scenes.entries import (
     is_number,
     mask_files,
     read_object,
-    require_fetched,
+    reading,
     short,
     some,
     unit_times,
@@ -308,16 +308,12 @@ def _points(path: Path) -> np.ndarray | None:
     """Points of the background, before they are centred and scaled. float64 [N, 3]"""
     if not path.is_file():
         return None
-    require_fetched(path)
-    try:
+    advice = f"{DOWNLOAD} Or remove it: it is not needed."
+    with reading(path, advice=advice):
         points = np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float64)
-    except (OSError, ValueError, EOFError) as problem:
-        raise SceneError(
-            f"{path} cannot be read ({problem}). {DOWNLOAD} Or remove it: it is not needed."
-        ) from problem
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise SceneError(
             f"{path} holds an array {list(points.shape)}; it must be finite positions [N, 3]. "
-            f"{DOWNLOAD} Or remove it: it is not needed."
+            f"{advice}"
         )
     return points

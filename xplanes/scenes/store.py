@@ -357,7 +357,7 @@ def _write(path: Path, sizes: Sequence[Size], channels: int, jobs: Sequence[Job]
     """Decode all images to a file, with one image per thread in memory."""
     from tqdm import tqdm
 
-    first, turn, done = _firsts(sizes), threading.Lock(), []
+    first, turn = _firsts(sizes), threading.Lock()
     with (
         path.open("r+b", buffering=0) as file,
         tqdm(
@@ -379,11 +379,9 @@ def _write(path: Path, sizes: Sequence[Size], channels: int, jobs: Sequence[Job]
                     # One call may write only a part, at most 2 GB on Linux.
                     while len(content):
                         content = content[file.write(content) :]
-            done.append(index)
             bar.update()
 
         _run(jobs, keep)
-        assert len(done) == len(sizes)
 
 
 def _run(jobs: Sequence[Job], keep: Callable[[int, np.ndarray], None]) -> None:

@@ -23,7 +23,7 @@ from xplanes.files import DAY, MARK, StorageError
 from xplanes.scenes import store
 from xplanes.scenes.batches import AHEAD, RayBatches
 from xplanes.scenes.frame import cube_frame, scene_frame
-from xplanes.scenes.images import final_sizes, native_sizes
+from xplanes.scenes.images import Picture, final_sizes, native_sizes
 from xplanes.scenes.images import read_images as read_sized
 from xplanes.scenes.lenses import Lenses, LensModel
 from xplanes.scenes.matte import silhouette_of
@@ -48,7 +48,7 @@ def pictures(folder: Path, sizes, *, alpha: bool) -> list[Path]:
 def read_images(paths: list[Path], resolution: int | None = None, cache: Path | None = None):
     native = native_sizes(paths)
     sizes = final_sizes(paths, native, resolution)
-    return read_sized(paths, sizes, cache=cache), native, sizes
+    return read_sized([*map(Picture, paths, sizes)], cache), native, sizes
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_a_file_holds_the_pixels_of_memory(tmp_path, monkeypatch, alpha):
     for index in range(4 if alpha else 0):
         seen = silhouette_of(expected[index, : SIZES[index][0], : SIZES[index][1], 3])
         assert torch.equal(images.silhouette(index), seen), index
-    backwards = images.subset(torch.tensor([2, 0]))
+    backwards = images[torch.tensor([2, 0])]
     assert torch.equal(backwards.image(0), images.image(2))
     if hasattr(os, "pread"):  # Forked processes share the position: reading must not move it.
         assert file._file.tell() == 0

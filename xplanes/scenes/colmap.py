@@ -11,8 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import ClassVar
 
-import numpy as np
-
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.files import natural
 from xplanes.scenes.colmap_model import (
@@ -36,13 +34,7 @@ from xplanes.scenes.entries import (
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import Listing, held_out, time_source
 from xplanes.scenes.name_times import OTHER_TIMES, times_in_names
-from xplanes.scenes.rigs import (
-    POSES,
-    STATIC,
-    are_registered,
-    is_dynamic,
-    recordings_of_cameras,
-)
+from xplanes.scenes.rigs import POSES, STATIC, are_registered, is_dynamic, recordings_of_cameras
 from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.views import Scene
 from xplanes.settings import Location
@@ -122,9 +114,9 @@ class ColmapSettings(CaptureSettings):
                 "data.test_cameras, or choose another data.eval_split."
             )
         model = read_model(_model_folder(self.folder, self.model))
-        listing, folders, points = self._listing(model)
-        places = self._places(listing, folders)
-        scene = self.capture(listing, places, splits, model.source, points)
+        listing = self._listing(model)
+        points = model.points
+        scene = self.capture(listing, self._places(listing), splits, model.source, points)
         notes = dict(scene.notes)
         if self._as_llff:
             notes["poses"] = f"those of COLMAP; data=llff reads {POSES}"
@@ -140,15 +132,17 @@ class ColmapSettings(CaptureSettings):
         """Whether the capture is one of LLFF's static ones, too, as in Mip-NeRF 360."""
         return (self.folder / POSES).is_file() and not is_dynamic(self.folder)
 
-    def _listing(self, model: SparseModel) -> tuple[Listing, list[str], np.ndarray | None]:
-        """All images of the capture, the folder of each, and the model's points."""
+    def _listing(self, model: SparseModel) -> Listing:
+        """All images of the capture."""
         images = _image_folder(self.folder, self.images, model)
         root = images.resolve()
 
-        def image_of(name: str) -> Path:
-            return image_path(f"{model.source}: {name}", root, name, "NAME")
+        def image_of(place: int) -> tuple[int, Path]:
+            name = model.names[place]
+            return place, image_path(f"{model.source}: {name}", root, name, "NAME")
 
-        kept, paths = zip(*usable("images", image_of, model.names), strict=True)
+        places = range(len(model.names))
+        kept, paths = zip(*usable("images", image_of, places), strict=True)
         model = model.subset(kept)
         labels = [f"{model.source}: {name}" for name in model.names]
         # The search does not enter folders that are links.
@@ -163,7 +157,7 @@ class ColmapSettings(CaptureSettings):
                 *(len(rest), len(present), images, some(rest)),
             )
         times, source = self._times(model.names, labels, used, present)
-        listing = Listing.checked(
+        return Listing.checked(
             model.source,
             labels,
             paths,
@@ -173,8 +167,8 @@ class ColmapSettings(CaptureSettings):
             calibrations=model.calibrations,
             masks=() if self.masks is None else self._masks(model.names, self.masks),
             time_source=source,
+            names=model.names,
         )
-        return listing, [_camera(name) for name in model.names], model.points
 
     def _masks(self, names: Sequence[str], masks: str) -> tuple[Path | None, ...]:
         kinds = [
@@ -211,8 +205,8 @@ class ColmapSettings(CaptureSettings):
         )
         return unit_times(found), time_source(origin, names, found)
 
-    def _places(self, listing: Listing, folders: Sequence[str]) -> dict[str, list[int]]:
-        tested: set[int] = set()
+    def _places(self, listing: Listing) -> dict[str, list[int]]:
+        folders, tested = [_camera(name) for name in listing.names], set[int]()
         for camera in self.test_cameras:
             inside = f"{camera.strip('/')}/"
             chosen = {at for at, name in enumerate(folders) if f"{name}/".startswith(inside)}

@@ -18,7 +18,7 @@ from typing import BinaryIO, TypeVar
 import numpy as np
 
 from xplanes.errors import BrokenFrameError, SceneError
-from xplanes.scenes.entries import decoded, number_in, require_fetched, short, usable
+from xplanes.scenes.entries import decoded, number_in, reading, short, usable
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
 from xplanes.scenes.listing import Calibration
 
@@ -141,8 +141,7 @@ def read_model(folder: Path) -> SparseModel:
             f"{images_path} lists no images: COLMAP has registered none. Run its mapper again, or "
             "choose another model."
         )
-    posed = usable("images", lambda image: _pose(image[2], image[3]), images)
-    images = [(*images[place][:2], pose) for place, pose in posed]
+    images = usable("images", lambda image: (*image[:2], _pose(*image[2:])), images)
     for (name, *_), (after, *_) in pairwise(images):
         if name == after:
             raise SceneError(f"{images_path} lists {name} twice. Remove one of the two.")
@@ -226,12 +225,8 @@ _AGAIN = "Copy it again, or export the model again with colmap model_converter."
 
 @contextmanager
 def _binary(path: Path) -> Iterator[_Binary]:
-    require_fetched(path)
-    try:
-        with path.open("rb") as file:
-            yield _Binary(path, file)
-    except OSError as problem:
-        raise SceneError(f"{path} cannot be read ({problem}).") from problem
+    with reading(path), path.open("rb") as file:
+        yield _Binary(path, file)
 
 
 HEADER = 4096
@@ -240,11 +235,8 @@ HEADER = 4096
 
 def _text_lines(path: Path) -> Iterator[tuple[str, str]]:
     """Lines that are not comments, each with its label."""
-    require_fetched(path)
-    try:
+    with reading(path, "as text", _AGAIN):
         text = decoded(path.read_bytes())
-    except (OSError, UnicodeDecodeError) as problem:
-        raise SceneError(f"{path} cannot be read as text ({problem}). {_AGAIN}") from problem
     for number, line in enumerate(text.split("\n"), start=1):
         if not line.startswith("#"):
             yield f"{path}: line {number}", line.strip()

@@ -66,12 +66,10 @@ class SceneDataModule(LightningDataModule):
         plugins: Sequence[str] = (),
     ) -> None:
         super().__init__()
-        settings = scene if isinstance(scene, SceneSettings) else _settings(scene, plugins)
-        self._begin(settings, seed)
-        self.save_hyperparameters({"scene": settings.plain(), "seed": seed})
-
-    def _begin(self, settings: SceneSettings, seed: int) -> None:
-        self.settings, self.seed = settings, seed
+        self.settings = scene if isinstance(scene, SceneSettings) else _settings(scene, plugins)
+        self.seed = seed
+        if not isinstance(scene, _GivenScene):
+            self.save_hyperparameters({"scene": self.settings.plain(), "seed": seed})
         self.first = 0
         """Number of batches already drawn."""
         self.holds_out = True
@@ -103,9 +101,7 @@ class SceneDataModule(LightningDataModule):
             scene: The scene.
             seed: Seed for drawing rays.
         """
-        data = cls.__new__(cls)
-        LightningDataModule.__init__(data)
-        data._begin(_GivenScene.around(scene), seed)
+        data = cls(_GivenScene.around(scene), seed=seed)
         data.scene = scene
         return data
 

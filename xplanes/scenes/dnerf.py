@@ -6,15 +6,12 @@ from pathlib import Path
 from typing import ClassVar
 
 from xplanes.errors import MissingSplitError, SceneError, warn
-from xplanes.scenes.entries import spelt
+from xplanes.scenes.entries import SPLIT_FOLDERS, spelt
 from xplanes.scenes.listing import Listing
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.source import SceneSettings, warn_of_masks
 from xplanes.scenes.transforms import all_masks, listing_of, read_frames, readable, time_span
 from xplanes.scenes.views import Scene
-
-PARTS = ("train", "val", "test", "video")
-"""Parts that share a unit of time, and the meaning of masks: splits, and a fixed camera's video."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,13 +58,14 @@ def read_scene(settings: SceneSettings, splits: Sequence[str], mask_use: MaskUse
     if not any(folder.glob("transforms_*.json")):
         raise settings.no_scene()
     paths = {split: _transforms_path(folder, split) for split in dict.fromkeys(splits)}
-    contents = readable([folder / f"transforms_{part}.json" for part in PARTS])
+    # All parts share a unit of time, and the meaning of masks.
+    contents = readable([folder / f"transforms_{part}.json" for part in SPLIT_FOLDERS])
     span = time_span(contents.values())
     listed = {split: _listed(split, path, span) for split, path in paths.items()}
     _warn_of_shared_files(folder, listed)
     listed = settings.thinned(listed)
     video = _list_video(folder, span)
-    _require_times(folder, listed, video)
+    _require_times(folder, listed if video is None else {**listed, "video": video})
     # Masks mean the same whichever parts are read.
     return settings.scene_of(listed, mask_use, all_masks(contents), video=video)
 
@@ -98,14 +96,13 @@ def _warn_of_shared_files(folder: Path, parts: Mapping[str, Listing]) -> None:
             )
 
 
-def _require_times(folder: Path, parts: Mapping[str, Listing], video: Listing | None) -> None:
+def _require_times(folder: Path, parts: Mapping[str, Listing]) -> None:
     """Refuse splits and videos of a dynamic scene that have no times."""
     train = parts.get("train")
     if train is None or len(train.times.unique()) == 1:
         return
-    others = parts if video is None else {**parts, "video": video}
-    for split, listing in others.items():
-        if not listing.timed:
+    for split, listing in parts.items():
+        if not listing.time_source:
             raise SceneError(
                 f'No frame of {folder / f"transforms_{split}.json"} has a "time", but those of '
                 "transforms_train.json have several. Give every frame its time."

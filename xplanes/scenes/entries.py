@@ -7,9 +7,9 @@ import os
 import re
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import lru_cache
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PureWindowsPath
 from typing import Any, TypeGuard, TypeVar
 from urllib.parse import unquote
 
@@ -70,24 +70,15 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
         BrokenFrameError: If there is no such file, or it is empty.
         SceneError: If it is not a name, or leaves the folder.
     """
-    choices = []
-    for image in paths_inside(label, folder, name, key, "./train/r_000"):
-        if image.is_file():
-            return _with_content(label, image)
-        choices.append(image)
-    inside = [folder / "images" / path.name for path in choices if path.parent == folder]
-    for image in inside:
-        if image.is_file():
-            return _with_content(label, image)
-    choices += inside
-    for image in choices:
-        if (parent := _like(image.parent)) is None:
-            continue
-        wanted = image.stem if image.suffix.lower() in ENDINGS else image.name
-        found = _stems(parent).get(_normalised(wanted), ())
-        same = [path for path in found if _normalised(path.name) == _normalised(image.name)]
-        if len(chosen := same or found) == 1:
-            return _with_content(label, chosen[0])
+    choices = [*paths_inside(label, folder, name, key, "./train/r_000")]
+    choices += [folder / "images" / path.name for path in choices if path.parent == folder]
+    image = next(filter(Path.is_file, choices), None)
+    if image is None:
+        image = next(filter(None, map(_similar, choices)), None)
+    if image is not None:
+        if image.stat().st_size == 0:
+            raise BrokenFrameError(f"{label}: {image} holds 0 bytes. Copy the file again.")
+        return image
     if (plain := unquote(name)) != name:  # Percent-encoded, as in URLs.
         return image_path(label, folder, plain, key)
     if Path(name).is_absolute() and Path(name).is_file():
@@ -101,16 +92,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
     )
 
 
-def _with_content(label: str, image: Path) -> Path:
-    if image.stat().st_size == 0:
-        raise BrokenFrameError(f"{label}: {image} holds 0 bytes. Copy the file again.")
-    return image
-
-
-def usable(
-    what: str, read: Callable[[Item], Found], items: Sequence[Item]
-) -> list[tuple[int, Found]]:
-    """Results of a function for usable frames, with their indices; warns about the others.
+def usable(what: str, read: Callable[[Item], Found], items: Sequence[Item]) -> list[Found]:
+    """Results of a function for usable frames; warns about the others.
 
     Args:
         what: Name of the frames, for the warning.
@@ -121,11 +104,11 @@ def usable(
         MissingSplitError: If all frames are left out.
         SceneError: If ``read`` raises other errors; the message has all of them.
     """
-    found: list[tuple[int, Found]] = []
+    found: list[Found] = []
     left_out, wrong = [], []
-    for place, item in enumerate(items):
+    for item in items:
         try:
-            found.append((place, read(item)))
+            found.append(read(item))
         except BrokenFrameError as problem:
             left_out.append(str(problem))
         except SceneError as problem:
@@ -169,6 +152,19 @@ def _like(folder: Path) -> Path | None:
         path for path in parent.iterdir() if _normalised(path.name) == _normalised(folder.name)
     ]
     return names[0] if len(names) == 1 and names[0].is_dir() else None
+
+
+def _similar(image: Path) -> Path | None:
+    """An image, or else the only one whose name differs in case, accents or format alone."""
+    if image.is_file():
+        return image
+    if (parent := _like(image.parent)) is None:
+        return None
+    wanted = image.stem if image.suffix.lower() in ENDINGS else image.name
+    found = _stems(parent).get(_normalised(wanted), [])
+    same = [path for path in found if _normalised(path.name) == _normalised(image.name)]
+    chosen = same or found
+    return chosen[0] if len(chosen) == 1 else None
 
 
 def spelt(name: Any) -> str:
@@ -227,24 +223,16 @@ def mask_files(folder: Path, names: Sequence[Sequence[str]]) -> tuple[Path | Non
     Raises:
         SceneError: If no image has a mask.
     """
-    root = _like(folder)
-    masks = tuple(None if root is None else _mask(root, each) for each in names)
+    # PNG takes precedence over other endings.
+    choices = [[folder / f"{name}.png" for name in each] for each in names]
+    masks = tuple(next(filter(None, map(_similar, each)), None) for each in choices)
     if not any(masks):
+        where = "holds" if _like(folder) else "does not exist, so there is"
         raise SceneError(
-            f"data.masks: {folder} {'holds' if root else 'does not exist, so there is'} no mask of "
-            f"any image, such as {names[0][0]}.png. Put the masks there, or set data.masks=null."
+            f"data.masks: {folder} {where} no mask of any image, such as {names[0][0]}.png. Put "
+            "the masks there, or set data.masks=null."
         )
     return masks
-
-
-def _mask(root: Path, names: Sequence[str]) -> Path | None:
-    """The mask that has one of the names; PNG takes precedence over other endings."""
-    for name in names:
-        if (parent := _like((root / name).parent)) is not None:
-            found = _stems(parent).get(_normalised(PurePosixPath(name).name), [])
-            if len(chosen := [path for path in found if path.suffix == ".png"] or found) == 1:
-                return chosen[0]
-    return None
 
 
 def unit_times(times: Sequence[float], span: tuple[float, float] | None = None) -> list[float]:
@@ -269,13 +257,8 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
     Raises:
         SceneError: If it cannot be read, or is not an object.
     """
-    require_fetched(path)
-    try:
+    with reading(path, "as JSON", "Export or download it again."):
         found = _parsed(_text(path))
-    except (OSError, ValueError, RecursionError) as problem:
-        raise SceneError(
-            f"{path} cannot be read as JSON ({problem}). Export or download it again."
-        ) from problem
     if not isinstance(found, dict):
         raise SceneError(f"{path} must hold a JSON object with {content}, not {short(found)}.")
     return found
@@ -308,14 +291,27 @@ def decoded(content: bytes) -> str:
     return content.decode(json.detect_encoding(content))
 
 
-def require_fetched(path: Path) -> None:
-    """Refuse a placeholder of a file that was not fetched, such as a pointer of Git LFS.
+@contextmanager
+def reading(path: Path, how: str = "", advice: str = "") -> Iterator[None]:
+    """Refuse a file that was not fetched, such as a pointer of Git LFS, or that cannot be read.
+
+    Args:
+        path: The file that is read in the block.
+        how: How it is read, such as "as JSON", for the message.
+        advice: Further text of the message.
 
     Raises:
-        SceneError: With the kind of placeholder, and how to fetch the file.
+        SceneError: With the kind of placeholder, or the problem in the block.
     """
     if (other := stand_in(path)) is not None:
         raise SceneError(f"{path} {other}.")
+    try:
+        yield
+    except SceneError:
+        raise
+    except (OSError, ValueError, EOFError, RecursionError) as problem:
+        words = " ".join(filter(None, [str(path), "cannot be read", how, f"({problem}).", advice]))
+        raise SceneError(words) from problem
 
 
 def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.ndarray:
@@ -424,36 +420,15 @@ def world_turn(
     return None, f"the z axis of the files; the cameras' mean up vector is {off:.3g} degrees off"
 
 
-def require_precision(source: Path, positions: np.ndarray) -> None:
-    """Refuse cameras so far from the world's origin that single precision changes their poses.
-
-    Args:
-        source: File of the cameras, for messages.
-        positions: Positions of all cameras of a capture. float64 [V, 3]
-
-    Raises:
-        SceneError: If they are too far away.
-    """
-    extent = float(np.ptp(positions, axis=0).max())
-    largest = float(np.abs(positions).max())
-    fixed = extent <= SAME_PLACE
-    room = FARTHEST if fixed else ROUNDING * extent / float(np.finfo(np.float32).eps)
-    if not largest <= min(room, FARTHEST):
-        raise SceneError(
-            f"{source}: the cameras lie up to {largest:.3g} world units from the origin and "
-            f"{extent:.3g} apart, which single precision cannot resolve. Subtract the same vector "
-            "from the positions of all cameras, as colmap model_transformer does, or correct them."
-        )
-
-
-def origin_near(source: Path, positions: np.ndarray) -> np.ndarray:
+def origin_near(source: Path, positions: np.ndarray, movable: bool = True) -> np.ndarray:
     """A point relative to which single precision resolves the cameras: if possible, the origin.
 
     Captures in map coordinates lie millions of metres away, where numbers are half a metre apart.
 
     Args:
-        source: As for `require_precision`.
-        positions: As for `require_precision`.
+        source: File of the cameras, for messages.
+        positions: Positions of all cameras of a capture. float64 [V, 3]
+        movable: Whether it may be another point than the origin.
 
     Returns:
         float64 [3]
@@ -461,12 +436,21 @@ def origin_near(source: Path, positions: np.ndarray) -> np.ndarray:
     Raises:
         SceneError: If there is no such point.
     """
+    extent = float(np.ptp(positions, axis=0).max())
+    fixed = extent <= SAME_PLACE
+    room = FARTHEST if fixed else ROUNDING * extent / float(np.finfo(np.float32).eps)
     origin = np.zeros(3)
-    try:
-        require_precision(source, positions)
-    except SceneError:
+    largest = float(np.abs(positions).max())
+    if movable and not largest <= min(room, FARTHEST):
         origin = positions.mean(axis=0).round()
-        require_precision(source, positions - origin)
+        largest = float(np.abs(positions - origin).max())
+    if not largest <= min(room, FARTHEST):
+        raise SceneError(
+            f"{source}: the cameras lie up to {largest:.3g} world units from the origin and "
+            f"{extent:.3g} apart, which single precision cannot resolve. Subtract the same vector "
+            "from the positions of all cameras, as colmap model_transformer does, or correct them."
+        )
+    if origin.any():
         x, y, z = origin.tolist()
         warn(
             f"{source}: the origin is far away, so positions are read relative to "
@@ -518,6 +502,25 @@ def is_number(value: Any) -> TypeGuard[float]:
         return False
 
 
+def is_positive(value: Any) -> TypeGuard[float]:
+    """Whether a value read from a file is a finite number above 0."""
+    return is_number(value) and value > 0
+
+
+def checked_number(
+    where: str | Path, key: str, value: Any, positive: bool = False, more: str = ""
+) -> float:
+    """A finite number, or one above 0, read from a file.
+
+    Raises:
+        SceneError: If it is none; ``more`` is added to the sentence.
+    """
+    if not (is_positive(value) if positive else is_number(value)):
+        above = " above 0" if positive else ""
+        raise SceneError(f"{where}: {key} is {short(value)}; it must be a number{above}{more}.")
+    return value
+
+
 def number_in(text: str) -> float | None:
     """The finite number in a string, an int if it is written as one; None for other strings."""
     for kind in (int, float):
@@ -525,11 +528,6 @@ def number_in(text: str) -> float | None:
             number = kind(text)
             return number if is_number(number) else None
     return None
-
-
-def is_positive(value: Any) -> TypeGuard[float]:
-    """Whether a value read from a file is a finite number above 0."""
-    return is_number(value) and value > 0
 
 
 def short(value: Any) -> str:

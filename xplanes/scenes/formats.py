@@ -2,7 +2,8 @@
 
 import re
 import struct
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
@@ -75,12 +76,9 @@ def is_image(path: Path) -> bool:
 
 def read_header(path: Path) -> tuple[tuple[int, int], bool]:
     """Height and width of an image file, and whether it may have alpha."""
-    try:
-        with open_image(path) as picture:
-            alpha = "A" in picture.getbands() or "transparency" in picture.info
-            return (picture.height, picture.width), alpha
-    except UNREADABLE as problem:
-        raise unreadable(path, problem) from problem
+    with open_image(path) as picture:
+        alpha = "A" in picture.getbands() or "transparency" in picture.info
+        return (picture.height, picture.width), alpha
 
 
 def orientation(path: Path) -> int:
@@ -129,31 +127,30 @@ def _opened(path: Path) -> Image.Image:
     return Image.open(path, formats=_formats())
 
 
-def open_image(path: Path) -> Image.Image:
+@contextmanager
+def open_image(path: Path) -> Iterator[Image.Image]:
     """Open an image with its pixels as they are stored; usually only the header is read.
 
     Raises:
-        OSError: If it is not an image; also others of `UNREADABLE`.
+        SceneError: If it cannot be decoded, here or in the block.
     """
-    picture = _opened(path)
-    if not isinstance(picture, TiffImageFile):
-        return picture
-    # Pillow applies the EXIF orientation only to TIFF files.
-    if (turn := TURNED_BACK.get(picture.tag_v2.get(ORIENTATION, 1))) is None:
-        return picture
-    with picture:
-        stored = picture.transpose(turn)
-    stored.format = picture.format
-    return stored
+    try:
+        with _opened(path) as picture:
+            turn = None
+            if isinstance(picture, TiffImageFile):
+                # Pillow applies the EXIF orientation only to TIFF files.
+                turn = TURNED_BACK.get(picture.tag_v2.get(ORIENTATION, 1))
+            stored = picture if turn is None else picture.transpose(turn)
+            stored.format = picture.format
+            yield stored
+    except SceneError:
+        raise
+    except UNREADABLE as problem:
+        raise _unreadable(path, problem) from problem
 
 
-def unreadable(path: Path, problem: BaseException) -> SceneError:
-    """The error for a file that cannot be decoded.
-
-    Args:
-        path: The file.
-        problem: The decoder's error.
-    """
+def _unreadable(path: Path, problem: BaseException) -> SceneError:
+    """The error for a file that cannot be decoded, with the decoder's error."""
     if (other := stand_in(path)) is not None:
         return SceneError(f"{path} {other}.")
     kind = "a camera's raw format" if path.suffix.lower() in RAW else None

@@ -1,7 +1,9 @@
 """Decodes image files, premultiplies them by alpha and reduces them to the working resolution."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +12,7 @@ from torch import Tensor
 
 from xplanes.errors import SceneError, all_of
 from xplanes.scenes import store
-from xplanes.scenes.formats import (
-    SIXTEEN_BIT_MODES,
-    UNREADABLE,
-    open_image,
-    read_header,
-    unreadable,
-)
+from xplanes.scenes.formats import SIXTEEN_BIT_MODES, open_image, read_header
 from xplanes.scenes.masks import MaskKind, read_mask
 from xplanes.scenes.store import Size
 
@@ -27,6 +23,35 @@ GREY = MaskKind(labels=False)
 
 MASKS = 3
 """Version of the treatment of masks; increase it whenever decoded images change."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image file, and how it is decoded.
+
+    Attributes:
+        path: The file.
+        size: Height and width of the reduced image.
+        mask: File by which alpha is multiplied; None for none.
+        kind: Meaning of the mask, see `masks.read_mask`.
+        clear: Grey levels, out of 255, that are transparent.
+        has_ray: Pixels of the reduced image with a ray; None for all. bool [h, w]
+    """
+
+    path: Path
+    size: Size
+    mask: Path | None = None
+    kind: MaskKind = GREY
+    clear: tuple[int, ...] = ()
+    has_ray: Tensor | None = None
+
+    def decoded(self) -> np.ndarray:
+        """Colour, premultiplied by alpha before it is averaged, and alpha. uint8 [h, w, 4]"""
+        channels = load_premultiplied(self.path, self.clear)
+        if self.mask is not None:
+            channels *= read_mask(self.mask, self.kind, self.path)
+        height, width = self.size
+        return cleared(shrink(channels, width, height), self.has_ray)
 
 
 def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
@@ -42,16 +67,10 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
     Raises:
         SceneError: If a file cannot be decoded, sizes differ, or the resolution cannot be met.
     """
-    native = native_sizes(paths)
-    for path, (height, width) in zip(paths, native, strict=True):
-        if (height, width) != native[0]:
-            raise SceneError(
-                f"{path} has {width}x{height} pixels, but {paths[0]} has "
-                f"{native[0][1]}x{native[0][0]}. All images must have one size: export or resize "
-                "them alike."
-            )
-    sizes = final_sizes(paths, native, resolution)
-    return store.in_memory(sizes, _jobs(paths, sizes))
+    advice = "All images must have one size: export or resize them alike."
+    size = shared_size(paths, str(paths[0]), advice)
+    sizes = final_sizes(paths, [size] * len(paths), resolution)
+    return store.in_memory(sizes, _jobs([*map(Picture, paths, sizes)]))
 
 
 def native_sizes(paths: Sequence[Path]) -> list[Size]:
@@ -61,6 +80,26 @@ def native_sizes(paths: Sequence[Path]) -> list[Size]:
         SceneError: If files are not images; the message names all of them.
     """
     return all_of(lambda path: read_header(path)[0], paths)
+
+
+def shared_size(paths: Sequence[Path], first: str, advice: str) -> Size:
+    """Height and width of image files that must have one size.
+
+    Args:
+        paths: The files, at least one.
+        first: Description of the first one, for messages.
+        advice: Further text of the message.
+
+    Raises:
+        SceneError: If their sizes differ, or files are not images.
+    """
+    size, *others = native_sizes(paths)
+    for path, (height, width) in zip(paths[1:], others, strict=True):
+        if (height, width) != size:
+            raise SceneError(
+                f"{path} has {width}x{height} pixels, but {first} has {size[1]}x{size[0]}. {advice}"
+            )
+    return size
 
 
 def width_rank(width: int, resolution: int | None) -> tuple[bool, int]:
@@ -100,69 +139,49 @@ def final_sizes(
 
 
 def read_images(
-    paths: Sequence[Path],
-    sizes: Sequence[Size],
-    masks: Sequence[Path | None] = (),
-    has_ray: Sequence[Tensor | None] = (),
-    cache: Path | None = None,
-    kind: MaskKind = GREY,
-    clear: Sequence[int] = (),
+    pictures: Sequence[Picture], cache: Path | None = None
 ) -> Tensor | store.StoredImages:
     """Decode images of any sizes and reduce them.
 
     Images that take more than `store.IN_MEMORY` bytes are decoded once to a file in the cache.
 
     Args:
-        paths: Image files, at least one. [V]
-        sizes: Height and width of each reduced image. [V]
-        masks: Files by which alpha is multiplied; empty if there are none. [V]
-        has_ray: For each reduced image, the pixels with a ray, bool [h, w], or None for all pixels;
-            empty if all images have all rays. [V]
+        pictures: At least one, with one kind of masks and the same transparent levels. [V]
         cache: Folder of decoded images; the user's cache when None.
-        kind: Meaning of the masks, see `masks.read_mask`.
-        clear: Grey levels, out of 255, that are transparent.
 
     Returns:
-        Colour, premultiplied by alpha before it is averaged, and alpha; smaller images are padded
-        with zeros at the bottom and on the right. uint8 [V, H, W, 4]
+        The images of `Picture.decoded`, padded with zeros at the bottom and on the right.
+        uint8 [V, H, W, 4]
 
     Raises:
         SceneError: If a file cannot be decoded, or a mask does not fit its image.
         StorageError: If the cache cannot be written.
     """
-    jobs = _jobs(paths, sizes, masks, has_ray, kind, clear)
-    sources = [*paths, *(mask for mask in masks if mask is not None)]
+    kind, clear = pictures[0].kind, pictures[0].clear
+    sources = [picture.path for picture in pictures]
+    masks = [picture.mask for picture in pictures if picture.mask is not None]
     meaning = [MASKS, kind.labels, kind.inverted]
-    recipe = ["images", meaning, [mask is not None for mask in masks], digests(has_ray), *clear]
-    cleared = bool(clear) or any(masks) or any(shown is not None for shown in has_ray)
+    masked = [picture.mask is not None for picture in pictures] if masks else []
+    has_ray = [picture.has_ray for picture in pictures]
+    recipe = ["images", meaning, masked, digests(has_ray), *clear]
 
     def has_alpha() -> bool:
-        return cleared or any(read_header(path)[1] for path in paths)
+        changed = clear or masks or any(shown is not None for shown in has_ray)
+        return bool(changed) or any(read_header(path)[1] for path in sources)
 
+    sizes, jobs = [picture.size for picture in pictures], _jobs(pictures)
     try:
-        return store.images(sizes, jobs, sources, recipe, has_alpha, cache)
+        return store.images(sizes, jobs, sources + masks, recipe, has_alpha, cache)
     except SceneError:
-        all_of(lambda job: sum(1 for _ in job()), jobs)  # Reports all files that fail.
+        all_of(Picture.decoded, pictures)  # Reports all files that fail.
         raise
 
 
-def _jobs(
-    paths: Sequence[Path],
-    sizes: Sequence[Size],
-    masks: Sequence[Path | None] = (),
-    has_ray: Sequence[Tensor | None] = (),
-    kind: MaskKind = GREY,
-    clear: Sequence[int] = (),
-) -> list[store.Job]:
-    def job(index: int) -> store.Job:
-        def decode() -> Iterator[tuple[int, np.ndarray]]:
-            mask = masks[index] if masks else None
-            pixels = read_image(paths[index], sizes[index], mask, kind, clear)
-            yield index, cleared(pixels, has_ray[index] if has_ray else None)
+def _jobs(pictures: Sequence[Picture]) -> list[store.Job]:
+    def decode(index: int) -> list[tuple[int, np.ndarray]]:
+        return [(index, pictures[index].decoded())]
 
-        return decode
-
-    return [job(index) for index in range(len(paths))]
+    return [partial(decode, index) for index in range(len(pictures))]
 
 
 def cleared(pixels: np.ndarray, shown: Tensor | None) -> np.ndarray:
@@ -181,34 +200,14 @@ def digests(masks: Sequence[Tensor | None]) -> list[str]:
     return [known[id(mask)] for mask in masks]
 
 
-def read_image(
-    path: Path,
-    size: Size,
-    mask: Path | None = None,
-    kind: MaskKind = GREY,
-    clear: Sequence[int] = (),
-) -> np.ndarray:
-    """Decode one image, multiply it by its mask, and reduce it. uint8 [H, W, 4]"""
-    channels = load_premultiplied(path, clear)
-    if mask is not None:
-        channels *= read_mask(mask, kind, path)
-    height, width = size
-    return shrink(channels, width, height)
-
-
 def load_premultiplied(path: Path, clear: Sequence[int] = ()) -> np.ndarray:
     """Decode one image to colour times alpha and alpha, from 0 to 255. float32 [4, H, W]
 
     Pixels with one of the grey levels ``clear`` are transparent.
     """
-    try:
-        with open_image(path) as picture:
-            picture.load()
-            channels = _straight_channels(path, picture)
-    except SceneError:
-        raise
-    except UNREADABLE as problem:
-        raise unreadable(path, problem) from problem
+    with open_image(path) as picture:
+        picture.load()
+        channels = _straight_channels(path, picture)
     for level in clear:
         channels[3, (channels[:3] == level).all(axis=0)] = 0
     channels[:3] *= channels[3] * np.float32(1 / 255)

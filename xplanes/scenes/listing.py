@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from xplanes.errors import MissingSplitError, SceneError, refuse_all, warn
-from xplanes.scenes.entries import origin_near, refuse_repeats, require_precision, some
+from xplanes.scenes.entries import origin_near, refuse_repeats, some
 from xplanes.scenes.formats import UNTURN, mask_misfit, orientation
-from xplanes.scenes.images import GREY, Size, final_sizes, native_sizes, read_images
+from xplanes.scenes.images import GREY, Picture, Size, final_sizes, native_sizes, read_images
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
-from xplanes.scenes.masks import MaskKind, ignored_pixels, survey
+from xplanes.scenes.masks import MaskKind, ignored_pixels
 from xplanes.scenes.views import Intrinsics, Views, spread
 
 SHORTEST, LONGEST = 1e-3, 1e5
@@ -104,7 +104,6 @@ class Listing:
         camera_to_world: Rigid camera poses with OpenGL's axes. [V, 4, 4]
         times: Time of each image, from 0 to 1; all 0 for a static scene. [V]
         calibrations: Focal length, principal point and lens of each image. [V]
-        timed: Whether the source has times.
         masks: A mask file for each image, white where it shows the scene and black elsewhere, or
             None for an image without; empty if there are none. [V]
         mask_meaning: Meaning of masks as defined by the source: "alpha", or "ignored" (white where
@@ -120,7 +119,6 @@ class Listing:
     camera_to_world: Tensor
     times: Tensor
     calibrations: tuple[Calibration, ...]
-    timed: bool
     masks: tuple[Path | None, ...] = ()
     mask_meaning: str = ""
     clear: tuple[int, ...] = ()
@@ -159,19 +157,13 @@ class Listing:
             SceneError: If cameras are too far away, an image is listed twice, or the sizes of files
                 and calibrations do not match.
         """
-        positions, origin = poses[:, :3, 3], np.zeros(3)
-        if movable:
-            origin = origin_near(source, positions)
-            poses = poses.copy()
-            poses[:, :3, 3] = positions - origin
-        else:
-            require_precision(source, positions)
+        origin, poses = origin_near(source, poses[:, :3, 3], movable), poses.copy()
+        poses[:, :3, 3] -= origin
         refuse_repeats(labels, paths, poses, times)
         listing = cls(
             paths=tuple(paths),
             camera_to_world=torch.from_numpy(poses).float(),
             times=torch.tensor(times or [0.0] * len(paths), dtype=torch.float32),
-            timed=bool(times),
             origin=tuple(origin.tolist()),
             **more,
         )
@@ -260,7 +252,7 @@ def read_views(
     resolution: int | None,
     cache: Path | None = None,
     ignore: bool = False,
-    kind: MaskKind | None = None,
+    kind: MaskKind = GREY,
 ) -> Views:
     """Read the images of a listing, with their masks, and reduce them to a width.
 
@@ -273,15 +265,13 @@ def read_views(
         cache: Folder of images that are too large for memory; the user's cache when None.
         ignore: Whether masked-out pixels are ignored; otherwise they get alpha 0. Images with only
             ignored pixels are left out, with a warning.
-        kind: Meaning of the masks; determined from the masks when None.
+        kind: Meaning of the masks.
 
     Raises:
         MissingSplitError: If all pixels of all images are masked out.
         SceneError: If a file cannot be decoded, the resolution cannot be met, or
             `final_intrinsics` refuses a camera.
     """
-    if kind is None:
-        kind = survey(listing.masks) if any(listing.masks) else GREY
     ignored = None
     native = native_sizes(listing.paths)
     sizes = final_sizes(listing.paths, native, resolution)
@@ -294,17 +284,16 @@ def read_views(
     names = [str(path) for path in listing.paths]
     intrinsics = final_intrinsics(names, listing.calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(listing))]
-    masks = () if ignore else listing.masks
-    images = read_images(listing.paths, sizes, masks, has_ray, cache, kind, listing.clear)
+    masks = [None] * len(listing) if ignore or not listing.masks else listing.masks
+    pictures = [
+        Picture(path, size, mask, kind, listing.clear, shown)
+        for path, size, mask, shown in zip(listing.paths, sizes, masks, has_ray, strict=True)
+    ]
+    images = read_images(pictures, cache)
     if ignored is not None:
         ignored = ignored[:, : images.shape[1], : images.shape[2]]
     views = Views(
-        images,
-        listing.camera_to_world,
-        listing.times,
-        intrinsics,
-        listing.files,
-        ignored=ignored,
+        images, listing.camera_to_world, listing.times, intrinsics, listing.files, ignored=ignored
     )
     empty = [file for index, file in enumerate(views.files) if not views.silhouette(index).any()]
     if empty:

@@ -13,13 +13,7 @@ from xplanes.scenes.formats import is_image
 from xplanes.scenes.images import native_sizes, width_rank
 from xplanes.scenes.listing import Listing, held_out, time_source
 from xplanes.scenes.name_times import times_in_names
-from xplanes.scenes.rigs import (
-    POSES,
-    STATIC,
-    is_dynamic,
-    read_poses_bounds,
-    recordings_of_cameras,
-)
+from xplanes.scenes.rigs import POSES, STATIC, is_dynamic, read_poses_bounds, recordings_of_cameras
 from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.views import Scene
 

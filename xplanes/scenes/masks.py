@@ -12,14 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from xplanes.errors import SceneError, warn
-from xplanes.scenes.formats import (
-    SIXTEEN_BIT_MODES,
-    UNREADABLE,
-    mask_misfit,
-    open_image,
-    read_header,
-    unreadable,
-)
+from xplanes.scenes.formats import SIXTEEN_BIT_MODES, mask_misfit, open_image, read_header
 
 logger = logging.getLogger(__name__)
 
@@ -238,12 +231,9 @@ def ignored_pixels(
 
 def _stored(path: Path) -> tuple[np.ndarray, bool]:
     """The values of a mask file from 0 to 1, and whether its format is lossy. float32 [H, W]"""
-    try:
-        with open_image(path) as picture:
-            white = 65535 if picture.mode in SIXTEEN_BIT_MODES else 255
-            return _grey(picture).astype(np.float32) / white, picture.format in LOSSY
-    except UNREADABLE as problem:
-        raise unreadable(path, problem) from problem
+    with open_image(path) as picture:
+        white = 65535 if picture.mode in SIXTEEN_BIT_MODES else 255
+        return _grey(picture).astype(np.float32) / white, picture.format in LOSSY
 
 
 def _grey(picture: Image.Image) -> np.ndarray:

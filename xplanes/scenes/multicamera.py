@@ -4,6 +4,7 @@ import logging
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -14,20 +15,15 @@ from torch import Tensor
 from xplanes.errors import ConfigError, MissingSplitError, SceneError, refuse_all, warn
 from xplanes.files import natural
 from xplanes.scenes import store, videos
-from xplanes.scenes.entries import (
-    origin_near,
-    some,
-    unit_times,
-    world_turn,
-)
+from xplanes.scenes.entries import origin_near, some, unit_times, world_turn
 from xplanes.scenes.formats import ENDINGS, read_header
 from xplanes.scenes.images import (
+    Picture,
     Size,
     cleared,
     digests,
     final_sizes,
-    native_sizes,
-    read_image,
+    shared_size,
     shrink,
 )
 from xplanes.scenes.listing import final_intrinsics, misshapen
@@ -42,9 +38,7 @@ from xplanes.scenes.rigs import (
     recordings_below,
 )
 from xplanes.scenes.source import SceneSettings
-from xplanes.scenes.transforms import (
-    stated_up,
-)
+from xplanes.scenes.transforms import stated_up
 from xplanes.scenes.views import Scene, Views
 
 logger = logging.getLogger(__name__)
@@ -205,18 +199,16 @@ def _distances(cameras: Sequence[Camera]) -> np.ndarray:
 
 def _video_camera(cameras: Sequence[Camera], parts: dict[str, list[int]], name: str | None) -> int:
     """Index of the camera whose video is the input of the LRM."""
-    train = parts["train"]
+    train = {cameras[index].name: index for index in parts["train"]}
     if name is None:
         away = _distances(cameras)
-        return min(train, key=lambda index: away[index])
-    found = [index for index, camera in enumerate(cameras) if camera.name == name]
-    if not found or found[0] not in train:
-        others = ", ".join(cameras[index].name for index in train)
+        return min(train.values(), key=lambda index: away[index])
+    if name not in train:
         raise SceneError(
             f"data.video_camera={name} is not a training camera, and the LRM must not see frames "
-            f"that are scored. Name one of {others}, or null for the most central."
+            f"that are scored. Name one of {', '.join(train)}, or null for the most central."
         )
-    return found[0]
+    return train[name]
 
 
 def _recording(camera: Camera) -> Recording:
@@ -229,14 +221,9 @@ def _recording(camera: Camera) -> Recording:
             f"{camera.source} holds no images ({', '.join(ENDINGS)}), nor does a folder in it. Add "
             f"the frames of the camera, or take it out of the calibration ({camera.label})."
         )
-    sizes = native_sizes(images)
-    for path, size in zip(images, sizes, strict=True):
-        if size != sizes[0]:
-            raise SceneError(
-                f"{path} has {size[1]}x{size[0]} pixels, but {images[0]} of the same camera has "
-                f"{sizes[0][1]}x{sizes[0][0]}. Export its frames alike."
-            )
-    return Recording(camera, sizes[0], len(images), None, images=tuple(images))
+    first = f"{images[0]} of the same camera"
+    size = shared_size(images, first, "Export its frames alike.")
+    return Recording(camera, size, len(images), None, images=tuple(images))
 
 
 def _are_stamped(recordings: Sequence[Recording]) -> bool:
@@ -380,7 +367,7 @@ def _read_views(
     has_ray = [intrinsics.has_ray(index) for index in range(len(recordings))]
     firsts = (counts.cumsum(0) - counts).tolist()
     jobs = [
-        _job(recording, own, size, shown, first)
+        partial(_decoded, recording, own, size, shown, first)
         for recording, own, size, shown, first in zip(
             recordings, numbers, sizes, has_ray, firsts, strict=True
         )
@@ -409,27 +396,18 @@ def _read_views(
     return views, camera
 
 
-def _job(
-    recording: Recording, numbers: range, size: Size, shown: Tensor | None, place: int
-) -> store.Job:
-    """Job that decodes the frames of a camera to the images from index ``place`` on."""
-
-    def decode() -> Iterator[tuple[int, np.ndarray]]:
-        if recording.images:
-            pictures = (read_image(recording.images[number], size) for number in numbers)
-        else:
-            video = videos.frames(recording.camera.source, numbers)
-            pictures = (_reduced(frame, size) for frame in video)
-        for offset, pixels in enumerate(pictures):
-            yield place + offset, cleared(pixels, shown)
-
-    return decode
-
-
-def _reduced(frame: np.ndarray, size: Size) -> np.ndarray:
-    """A video frame, reduced to its final size. uint8 [h, w, 3] -> [H, W, 3 or 4]"""
-    if frame.shape[:2] == size:
-        return frame
-    channels = np.full((4, *frame.shape[:2]), 255, np.float32)
-    channels[:3] = frame.transpose(2, 0, 1)
-    return shrink(channels, size[1], size[0])
+def _decoded(
+    recording: Recording, numbers: range, size: Size, shown: Tensor | None, first: int
+) -> Iterator[tuple[int, np.ndarray]]:
+    """The frames of a camera, decoded, and their indices, the first of which is given."""
+    if recording.images:
+        for place, number in enumerate(numbers, start=first):
+            yield place, Picture(recording.images[number], size, has_ray=shown).decoded()
+        return
+    for place, frame in enumerate(videos.frames(recording.camera.source, numbers), start=first):
+        pixels = frame
+        if frame.shape[:2] != size:
+            channels = np.full((4, *frame.shape[:2]), 255, np.float32)
+            channels[:3] = frame.transpose(2, 0, 1)
+            pixels = shrink(channels, size[1], size[0])
+        yield place, cleared(pixels, shown)

@@ -61,8 +61,7 @@ def times_in_names(names: Sequence[str]) -> list[Number]:
         names: Names of the images, with their folders. [V]
     """
     stems = [PurePosixPath(name).stem for name in names]
-    for read in (_dates, _clocks):
-        times = read(stems)
+    for times in (_dates(stems), [_clock(stem) for stem in stems]):
         found = [time for time in times if time is not None]
         if len(found) == len(names) and not _few(names, found):
             return _checked(names, found)
@@ -95,10 +94,6 @@ def _dates(stems: Sequence[str]) -> list[float | None]:
     if len(found) < len(stems) or (median(steps) < LEAST_STEP if steps else counted):
         return times
     return [time + part / 1000 for time, part in found]
-
-
-def _clocks(stems: Sequence[str]) -> list[float | None]:
-    return [_clock(stem) for stem in stems]
 
 
 def _date(stem: str) -> float | None:

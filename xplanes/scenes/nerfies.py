@@ -10,13 +10,13 @@ import numpy as np
 
 from xplanes.errors import BrokenFrameError, SceneError, warn
 from xplanes.scenes.entries import (
+    checked_number,
     checked_pose,
     image_path,
     is_number,
-    is_positive,
     mask_files,
     read_object,
-    require_fetched,
+    reading,
     short,
     some,
     unit_times,
@@ -65,8 +65,8 @@ class NerfiesSettings(CaptureSettings):
         names = list(dict.fromkeys(name for part in chosen.values() for name in part))
         pictures, lost = _picture_folder(folder, names, self.resolution)
         names = [name for name in names if name not in lost]
-        listing, names, points = self._listing(names, pictures)
-        places = {name: place for place, name in enumerate(names)}
+        listing, points = self._listing(names, pictures)
+        places = {name: place for place, name in enumerate(listing.names)}
         found = {
             split: [places[name] for name in part if name in places]
             for split, part in chosen.items()
@@ -75,10 +75,8 @@ class NerfiesSettings(CaptureSettings):
             found = held_out(listing, self.eval_every)
         return self.capture(listing, found, splits, source, points)
 
-    def _listing(
-        self, names: Sequence[str], pictures: str
-    ) -> tuple[Listing, Sequence[str], np.ndarray | None]:
-        """The usable images in a subfolder of rgb, their names, and the points."""
+    def _listing(self, names: Sequence[str], pictures: str) -> tuple[Listing, np.ndarray | None]:
+        """The usable images in a subfolder of rgb, and the points."""
         folder = self.folder
         root = folder.resolve()
         scale, centre = _scene(folder / "scene.json")
@@ -86,15 +84,15 @@ class NerfiesSettings(CaptureSettings):
         if not self.static:
             metadata = read_object(path, "the timestep of each image")
 
-        def camera_of(name: str) -> tuple[np.ndarray, Calibration]:
+        def camera_of(name: str) -> tuple[str, np.ndarray, Calibration]:
             label = str(folder / "dataset.json")
             if not self.static and not isinstance(metadata.get(name), dict):
                 raise BrokenFrameError(f"{path} has no object for {name}, such as {EXAMPLE}.")
-            return _camera(image_path(label, root, f"camera/{name}.json", "ids"))
+            return name, *_camera(image_path(label, root, f"camera/{name}.json", "ids"))
 
-        kept, cameras = zip(*usable("images", camera_of, names), strict=True)
-        names = [*map(names.__getitem__, kept)]
-        poses = np.stack([pose for pose, _ in cameras])
+        cameras = usable("images", camera_of, names)
+        names, poses, calibrations = zip(*cameras, strict=True)
+        poses = np.stack(poses)
         poses[:, :3, 3] = (poses[:, :3, 3] - centre) * scale
         points = _points(folder / "points.npy")
         if points is not None:
@@ -116,11 +114,12 @@ class NerfiesSettings(CaptureSettings):
             poses,
             times,
             files=tuple(path.relative_to(root).as_posix() for path in paths),
-            calibrations=tuple(calibration for _, calibration in cameras),
+            calibrations=calibrations,
             masks=masks,
             time_source=source,
+            names=names,
         )
-        return listing, names, points
+        return listing, points
 
     def _times(self, names: Sequence[str], metadata: Mapping[str, Any]) -> tuple[list[float], str]:
         """Times from 0 to 1, and their source; no times if the scene is static."""
@@ -133,10 +132,7 @@ class NerfiesSettings(CaptureSettings):
                 f"{path}: not all images have one of {', '.join(TIMES)}. Add the number of the "
                 "timestep to each image, or set data.static=true."
             )
-        times = [entry[key] for entry in entries]
-        for name, time in zip(names, times, strict=True):
-            if not is_number(time):
-                raise SceneError(f"{path}: {key} of {name} is {short(time)}; it must be a number.")
+        times = [checked_number(path, f"{key} of {name}", metadata[name][key]) for name in names]
         logger.info(
             "%s: %s from %s to %s is mapped to times from 0 to 1",
             *(path, key, min(times), max(times)),
@@ -203,10 +199,8 @@ def _names(path: Path, content: Mapping[str, Any], key: str) -> list[str]:
 def _scene(path: Path) -> tuple[float, np.ndarray]:
     """Scale and centre that normalise positions: ``(position - centre) * scale``."""
     content = read_object(path, "scale and center")
-    scale = content.get("scale")
-    if not is_positive(scale):
-        raise SceneError(f"{path}: scale is {short(scale)}; it must be a number above 0.")
-    return float(content["scale"]), _numbers(path, content, "center", 3)
+    scale = checked_number(path, "scale", content.get("scale"), positive=True)
+    return float(scale), _numbers(path, content, "center", 3)
 
 
 def _numbers(path: Path, content: Mapping[str, Any], key: str, count: int) -> np.ndarray:
@@ -237,14 +231,10 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
     pose[:3, :3] = orientation.T * [1, -1, -1]
     pose[:3, 3] = _numbers(path, content, "position", 3)
     checked_pose(str(path), pose, "orientation")
-    for key, default in (("focal_length", None), ("pixel_aspect_ratio", 1)):
-        if not is_positive(content.get(key, default)):
-            raise SceneError(
-                f"{path}: {key} is {short(content.get(key))}; it must be a number above 0."
-            )
-    skew = content.get("skew", 0)
-    if not is_number(skew):
-        raise SceneError(f"{path}: skew is {short(skew)}; it must be a number.")
+    focal = checked_number(path, "focal_length", content.get("focal_length"), positive=True)
+    aspect = content.get("pixel_aspect_ratio", 1.0)
+    aspect = checked_number(path, "pixel_aspect_ratio", aspect, positive=True)
+    skew = checked_number(path, "skew", content.get("skew", 0))
     width, height = _numbers(path, content, "image_size", 2)
     if width < 1 or height < 1:
         raise SceneError(
@@ -259,8 +249,8 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
     p1, p2 = _numbers(path, none | content, tangential, 2)
     distortion = (k1, k2, k3, 0.0, 0.0, 0.0, p1, p2)
     calibration = Calibration(
-        fl_x=float(content["focal_length"]),
-        fl_y=content["focal_length"] * content.get("pixel_aspect_ratio", 1.0),
+        fl_x=float(focal),
+        fl_y=focal * aspect,
         cx=float(centre_x),
         cy=float(centre_y),
         w=float(width),
@@ -318,16 +308,12 @@ def _points(path: Path) -> np.ndarray | None:
     """Points of the background, before they are centred and scaled. float64 [N, 3]"""
     if not path.is_file():
         return None
-    require_fetched(path)
-    try:
+    advice = f"{DOWNLOAD} Or remove it: it is not needed."
+    with reading(path, advice=advice):
         points = np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float64)
-    except (OSError, ValueError, EOFError) as problem:
-        raise SceneError(
-            f"{path} cannot be read ({problem}). {DOWNLOAD} Or remove it: it is not needed."
-        ) from problem
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise SceneError(
             f"{path} holds an array {list(points.shape)}; it must be finite positions [N, 3]. "
-            f"{DOWNLOAD} Or remove it: it is not needed."
+            f"{advice}"
         )
     return points

@@ -18,21 +18,10 @@ from xplanes.errors import SceneError, warn
 from xplanes.files import natural
 from xplanes.scenes import videos
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, image_count, read_model
-from xplanes.scenes.entries import (
-    checked_pose,
-    is_positive,
-    paths_inside,
-    require_fetched,
-    some,
-)
+from xplanes.scenes.entries import checked_pose, is_positive, paths_inside, reading, some
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import Calibration
-from xplanes.scenes.transforms import (
-    TRANSPARENT,
-    read_calibration,
-    read_frames,
-    warn_of_unknown,
-)
+from xplanes.scenes.transforms import TRANSPARENT, read_calibration, read_frames, warn_of_unknown
 
 POSES = "poses_bounds.npy"
 TRANSFORMS = "transforms.json"
@@ -214,13 +203,8 @@ def read_poses_bounds(
     Raises:
         SceneError: If it cannot be read, or has another number of rows.
     """
-    require_fetched(path)
-    try:
+    with reading(path, "as an array", "Export or download it again."):
         rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as problem:
-        raise SceneError(
-            f"{path} cannot be read as an array ({problem}). Export or download it again."
-        ) from problem
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
         raise SceneError(
             f"{path} holds {rows.dtype} {list(rows.shape)}, not one row of 17 numbers for each "

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -215,10 +215,10 @@ class SceneSettings(Settings, ABC):
         self,
         parts: Mapping[str, Listing],
         mask_use: MaskUse,
-        masks: tuple[Sequence[Path | None], str] | None = None,
+        masks: tuple[Sequence[Path | None], str],
         up: str = "",
         video: Listing | None = None,
-        **more: Any,
+        points: Tensor | None = None,
     ) -> Scene:
         """The scene of listed images, which are decoded here.
 
@@ -226,21 +226,16 @@ class SceneSettings(Settings, ABC):
             parts: The images of each split.
             mask_use: Meaning of the black parts of masks.
             masks: Masks of the whole capture, from which their meaning is determined for all
-                splits, and what their source says of it, as in `Listing`; those of ``parts`` when
-                None.
+                splits, and what their source says of it, as in `Listing`.
             up: Description of the up direction; empty if the files' world is unchanged.
             video: Frames of a fixed camera, if there are some.
-            **more: Further attributes of the scene.
+            points: World points on surfaces, if known. [N, 3]
 
         Raises:
             SceneError: If an image or a mask cannot be used, or with mask_use lrm if no training
                 image has a mask.
         """
-        listings = list(parts.values())
-        if masks is None:
-            told = next((listing.mask_meaning for listing in listings if listing.mask_meaning), "")
-            masks = [mask for listing in listings for mask in listing.masks], told
-        files, told = masks
+        listings, (files, told) = list(parts.values()), masks
         notes = {"times": source} if (source := listings[0].time_source) else {}
         use, kind, lrm_views = mask_use, GREY, None
         if mask_use == "lrm" and "train" in parts and not any(parts["train"].masks):
@@ -259,14 +254,19 @@ class SceneSettings(Settings, ABC):
             lrm_views = read(parts["train"]) if "train" in parts else None
             parts = {split: replace(part, masks=()) for split, part in parts.items()}
         splits = {split: read(part) for split, part in parts.items()}
-        more["video"] = None if video is None else read(video)
         if not up:
-            poses = torch.cat([listing.camera_to_world for listing in parts.values()])
+            poses = torch.cat([listing.camera_to_world for listing in listings])
             up = world_turn(poses, (), False)[1]
             if world_turn(poses, (), None)[0] is not None:
                 warn(f"{self.folder}: up is {up}. If the scene lies on its side, rotate the poses.")
-        notes = {**notes, "up": up}
-        return Scene(self.folder.resolve().name, splits, lrm_views=lrm_views, notes=notes, **more)
+        return Scene(
+            self.folder.resolve().name,
+            splits,
+            video=None if video is None else read(video),
+            points=points,
+            lrm_views=lrm_views,
+            notes={**notes, "up": up},
+        )
 
     def read(self, splits: Sequence[str] | None = None) -> Scene:
         """Read the scene as these settings specify.

@@ -96,26 +96,10 @@ class PixelFile:
                 content[offset : offset + len(part)] = part
         return cls(content, hashlib.sha256(content.data).hexdigest(), sizes, 4)
 
-    def image(self, index: int) -> Tensor:
-        """Premultiplied colour and alpha of an image. uint8 [h, w, 4]"""
-        height, width = self.sizes[index]
-        found = np.full((height * width, 4), 255, np.uint8)
-        found[:, : self.channels] = self.pixels(index, 0, height * width)
-        return torch.from_numpy(found).view(height, width, 4)
-
-    def silhouette(self, index: int) -> Tensor:
-        """The silhouette of an image, see `silhouette_of`. bool [h, w]"""
-        height, width = self.sizes[index]
-        if self.channels == 3:
-            return torch.ones(height, width, dtype=torch.bool)
-        count = height * width
-        bits = self._read(_bits(self.first, index), -(-count // 8))
-        return torch.from_numpy(np.unpackbits(bits, count=count)).bool().view(height, width)
-
     def pixels(self, index: int, start: int, count: int) -> np.ndarray:
         """Consecutive pixels of an image, fewer at its end. uint8 [count, C]"""
         first, end = self.first[index] + start, self.first[index + 1]
-        content = self._read(first * self.channels, min(count, end - first) * self.channels)
+        content = self.read(first * self.channels, min(count, end - first) * self.channels)
         return content.reshape(-1, self.channels)
 
     def prefetch(self, index: int, start: int, count: int) -> None:
@@ -124,7 +108,8 @@ class PixelFile:
             span = (self.first[index] + start) * self.channels, count * self.channels
             os.posix_fadvise(self._file.fileno(), *span, os.POSIX_FADV_WILLNEED)
 
-    def _read(self, offset: int, length: int) -> np.ndarray:
+    def read(self, offset: int, length: int) -> np.ndarray:
+        """Consecutive bytes. uint8 [length]"""
         if isinstance(self.source, np.ndarray):
             return self.source[offset : offset + length]
         assert self._file is not None
@@ -180,12 +165,20 @@ class StoredImages:
     def image(self, index: int) -> Tensor:
         """Premultiplied colour and alpha of a view. uint8 [h, w, 4]"""
         file, image = self.places[index]
-        return file.image(image)
+        height, width = file.sizes[image]
+        found = np.full((height * width, 4), 255, np.uint8)
+        found[:, : file.channels] = file.pixels(image, 0, height * width)
+        return torch.from_numpy(found).view(height, width, 4)
 
     def silhouette(self, index: int) -> Tensor:
         """The silhouette of a view, see `silhouette_of`. bool [h, w]"""
         file, image = self.places[index]
-        return file.silhouette(image)
+        height, width = file.sizes[image]
+        if file.channels == 3:
+            return torch.ones(height, width, dtype=torch.bool)
+        count = height * width
+        bits = file.read(_bits(file.first, image), -(-count // 8))
+        return torch.from_numpy(np.unpackbits(bits, count=count)).bool().view(height, width)
 
     def pixels(self, views: Tensor, runs: Tensor, inside: Tensor) -> Tensor:
         """Pixels of some runs of `RUN` pixels.
@@ -211,7 +204,7 @@ class StoredImages:
             file, image = self.places[view]
             file.prefetch(image, run * RUN, RUN)
 
-    def subset(self, indices: Tensor) -> "StoredImages":
+    def __getitem__(self, indices: Tensor) -> "StoredImages":
         """The images at ``indices``, in that order. [K]"""
         return StoredImages(self.places[index] for index in indices.tolist())
 
@@ -263,39 +256,7 @@ def images(
     height, width = _largest(sizes)
     if 4 * len(sizes) * height * width <= IN_MEMORY:
         return in_memory(sizes, jobs)
-    return _decoded(sizes, jobs, sources, recipe, 4 if has_alpha() else 3, folder)
-
-
-def in_memory(sizes: Sequence[Size], jobs: Sequence[Job]) -> Tensor:
-    """Decode images to one tensor, padded with zeros at the bottom and on the right.
-
-    Args:
-        sizes: Height and width of each image. [V]
-        jobs: Each decodes some of the images, in a thread.
-
-    Returns:
-        Premultiplied colour and alpha. uint8 [V, H, W, 4]
-    """
-    empty = torch.empty if len(set(sizes)) == 1 else torch.zeros
-    images = empty(len(sizes), *_largest(sizes), 4, dtype=torch.uint8)
-
-    def keep(index: int, pixels: np.ndarray) -> None:
-        height, width = sizes[index]
-        images[index, :height, :width] = torch.from_numpy(_with_channels(pixels, 4))
-
-    _run(jobs, keep)
-    return images
-
-
-def _decoded(
-    sizes: Sequence[Size],
-    jobs: Sequence[Job],
-    sources: Sequence[Path],
-    recipe: Any,
-    channels: int,
-    folder: Path | None,
-) -> StoredImages:
-    """The images in a file of the cache, decoded unless the file exists."""
+    channels = 4 if has_alpha() else 3
     is_default = folder is None
     folder = default_cache() if folder is None else folder
     states = [(str(path.resolve()), path.stat()) for path in sources]
@@ -336,7 +297,6 @@ def _decoded(
                 f"{length / 2**30:.1f} GB. Free some space, set data.cache to a folder on another "
                 "disk, or take fewer or smaller images"
             )
-        height, width = _largest(sizes)
         print(
             f"{len(sizes)} images of up to {width}x{height} px take {length / 2**30:.1f} GB "
             f"decoded, too much for memory: decoding them once to {path} (it can be deleted when "
@@ -349,6 +309,27 @@ def _decoded(
     ready = stored()
     assert ready is not None
     return ready
+
+
+def in_memory(sizes: Sequence[Size], jobs: Sequence[Job]) -> Tensor:
+    """Decode images to one tensor, padded with zeros at the bottom and on the right.
+
+    Args:
+        sizes: Height and width of each image. [V]
+        jobs: Each decodes some of the images, in a thread.
+
+    Returns:
+        Premultiplied colour and alpha. uint8 [V, H, W, 4]
+    """
+    empty = torch.empty if len(set(sizes)) == 1 else torch.zeros
+    images = empty(len(sizes), *_largest(sizes), 4, dtype=torch.uint8)
+
+    def keep(index: int, pixels: np.ndarray) -> None:
+        height, width = sizes[index]
+        images[index, :height, :width] = torch.from_numpy(_with_channels(pixels, 4))
+
+    _run(jobs, keep)
+    return images
 
 
 def _remove_unused(folder: Path) -> None:
@@ -376,7 +357,7 @@ def _write(path: Path, sizes: Sequence[Size], channels: int, jobs: Sequence[Job]
     """Decode all images to a file, with one image per thread in memory."""
     from tqdm import tqdm
 
-    first, turn, done = _firsts(sizes), threading.Lock(), []
+    first, turn = _firsts(sizes), threading.Lock()
     with (
         path.open("r+b", buffering=0) as file,
         tqdm(
@@ -398,11 +379,9 @@ def _write(path: Path, sizes: Sequence[Size], channels: int, jobs: Sequence[Job]
                     # One call may write only a part, at most 2 GB on Linux.
                     while len(content):
                         content = content[file.write(content) :]
-            done.append(index)
             bar.update()
 
         _run(jobs, keep)
-        assert len(done) == len(sizes)
 
 
 def _run(jobs: Sequence[Job], keep: Callable[[int, np.ndarray], None]) -> None:

@@ -15,6 +15,7 @@ from torch import Tensor
 from xplanes.errors import BrokenFrameError, MissingSplitError, SceneError, warn
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.entries import (
+    checked_number,
     checked_pose,
     image_path,
     is_number,
@@ -230,7 +231,7 @@ def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame
             )
         return _Frame(label, entry, image, mask, pose)
 
-    frames = [frame for _, frame in usable("frames", read, [*enumerate(entries)])]
+    frames = usable("frames", read, [*enumerate(entries)])
     if smaller:
         warn(
             f"{path}: {len(smaller)} of {len(entries)} images are missing and read from smaller "
@@ -504,10 +505,7 @@ def _times(
     key = _key([frame.entry for frame in frames])
     if frames[0].entry.get(key) is None:
         return [], ""
-    times = [frame.entry[key] for frame in frames]
-    for frame, time in zip(frames, times, strict=True):
-        if not is_number(time):
-            raise SceneError(f"{frame.label}: {key} is {short(time)}; it must be a number.")
+    times = [checked_number(frame.label, key, frame.entry[key]) for frame in frames]
     names = [frame.entry["file_path"] for frame in frames]
     source = time_source(f'"{key}" of {path.name}', names, times)
     first, last = span or (min(times), max(times))
@@ -571,16 +569,10 @@ def _pixels(name: str, keys: Mapping[str, Any]) -> dict[str, float]:
         return {key: keys[key] for key in ("w", "h") if is_positive(keys.get(key))}
     found = {}
     for key in PIXELS:
-        value = keys.get(key)
-        middle = key in ("cx", "cy")
-        if value is None or (value == 0 and not middle):
-            continue
-        if not (is_number(value) if middle else is_positive(value)):
-            raise SceneError(
-                f"{name}: {key} is {short(value)}; it must be a number"
-                f"{'' if middle else ' above 0'}, in pixels, or be left out."
-            )
-        found[key] = float(value)
+        value, above = keys.get(key), key not in ("cx", "cy")
+        if value is not None and not (value == 0 and above):
+            more = ", in pixels, or be left out"
+            found[key] = float(checked_number(name, key, value, above, more))
     return found
 
 

@@ -1,6 +1,7 @@
 """Frames of video files, decoded with PyAV (extra `video`)."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,29 +30,24 @@ def read_header(path: Path) -> tuple[Size, int, float | None, tuple[float, ...]]
         SceneError: If the file is not a video.
         MissingExtraError: If PyAV is not installed.
     """
-    av = require("av", extra="video")
-    try:
-        with av.open(str(path)) as container:
-            stream = _stream(path, container)
-            # Without frames hidden by an edit list, which the container's count includes.
-            stamps = [
-                packet.pts
-                for packet in container.demux(stream)
-                if packet.size > 0 and not packet.is_discard
-            ]
-            known = sorted(stamp for stamp in stamps if stamp is not None)
-            whole = len(known) == len(stamps) and stream.time_base is not None
-            times = tuple(float(stamp * stream.time_base) for stamp in known) if whole else ()
-            if (curve := stream.codec_context.color_trc) in HDR:
-                warn(
-                    f"{path} is an HDR video ({HDR[curve]}): without tone mapping its colours are "
-                    "pale. Convert it to SDR first."
-                )
-            size = (stream.codec_context.height, stream.codec_context.width)
-            rate = None if stream.average_rate is None else float(stream.average_rate)
-            return size, len(stamps), rate, times
-    except av.FFmpegError as problem:
-        raise _unreadable(path, problem) from problem
+    with _opened(path) as (container, stream):
+        # Without frames hidden by an edit list, which the container's count includes.
+        stamps = [
+            packet.pts
+            for packet in container.demux(stream)
+            if packet.size > 0 and not packet.is_discard
+        ]
+        known = sorted(stamp for stamp in stamps if stamp is not None)
+        whole = len(known) == len(stamps) and stream.time_base is not None
+        times = tuple(float(stamp * stream.time_base) for stamp in known) if whole else ()
+        if (curve := stream.codec_context.color_trc) in HDR:
+            warn(
+                f"{path} is an HDR video ({HDR[curve]}): without tone mapping its colours are "
+                "pale. Convert it to SDR first."
+            )
+        size = (stream.codec_context.height, stream.codec_context.width)
+        rate = None if stream.average_rate is None else float(stream.average_rate)
+        return size, len(stamps), rate, times
 
 
 def frames(path: Path, numbers: range) -> Iterator[np.ndarray]:
@@ -67,41 +63,41 @@ def frames(path: Path, numbers: range) -> Iterator[np.ndarray]:
     Raises:
         SceneError: If the file is damaged, ends before the last of them, or shows rotated frames.
     """
-    av = require("av", extra="video")
     number = -1
-    try:
-        with av.open(str(path)) as container:
-            stream = _stream(path, container)
-            stream.codec_context.thread_count = 1  # Several videos are decoded in parallel.
-            for number, frame in enumerate(container.decode(stream)):
-                if frame.rotation:
-                    raise SceneError(
-                        f"{path} is to be shown rotated by {frame.rotation} degrees, so that its "
-                        "pixels do not match its calibration. Encode it upright: ffmpeg -i "
-                        f"{path.name} upright{path.suffix}"
-                    )
-                if number in numbers:
-                    yield frame.to_ndarray(format="rgb24")
-                if number == numbers[-1]:
-                    return
-    except av.FFmpegError as problem:
-        raise _unreadable(path, problem) from problem
+    with _opened(path) as (container, stream):
+        stream.codec_context.thread_count = 1  # Several videos are decoded in parallel.
+        for number, frame in enumerate(container.decode(stream)):
+            if frame.rotation:
+                raise SceneError(
+                    f"{path} is to be shown rotated by {frame.rotation} degrees, so that its "
+                    "pixels do not match its calibration. Encode it upright: ffmpeg -i "
+                    f"{path.name} upright{path.suffix}"
+                )
+            if number in numbers:
+                yield frame.to_ndarray(format="rgb24")
+            if number == numbers[-1]:
+                return
     raise SceneError(
         f"{path} ends after frame {number}, but frame {numbers[-1]} is needed: it is probably "
         f"truncated. Download it again, or set data.frames=[{numbers[0]},{number},{numbers.step}]."
     )
 
 
-def _stream(path: Path, container: Any) -> Any:
-    if not container.streams.video:
-        raise SceneError(f"{path} holds no video stream. Put the camera's video in its place.")
-    return container.streams.video[0]
-
-
-def _unreadable(path: Path, problem: Exception) -> SceneError:
-    if (other := stand_in(path)) is not None:
-        return SceneError(f"{path} {other}.")
-    return SceneError(
-        f"{path} cannot be decoded as a video ({problem}). It is probably truncated or damaged: "
-        "export or download it again."
-    )
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """A video file and its stream of frames; refuses files that cannot be decoded in the block."""
+    av = require("av", extra="video")
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise SceneError(
+                    f"{path} holds no video stream. Put the camera's video in its place."
+                )
+            yield container, container.streams.video[0]
+    except av.FFmpegError as problem:
+        if (other := stand_in(path)) is not None:
+            raise SceneError(f"{path} {other}.") from problem
+        raise SceneError(
+            f"{path} cannot be decoded as a video ({problem}). It is probably truncated or "
+            "damaged: export or download it again."
+        ) from problem

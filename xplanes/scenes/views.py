@@ -346,10 +346,7 @@ class Views:
         """
         indices = torch.as_tensor(indices, dtype=torch.int64)
         intrinsics = self.intrinsics.subset(indices)
-        if isinstance(self.images, StoredImages):
-            images = self.images.subset(indices)
-        else:
-            images = self.images[indices]
+        images = self.images[indices]
         if isinstance(images, Tensor) and len(intrinsics) and self.is_padded:
             height, width = intrinsics.size.amax(dim=0).tolist()
             images = images[:, :height, :width].contiguous()

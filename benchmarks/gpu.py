@@ -48,9 +48,9 @@ from xplanes.decomposition import decompose
 from xplanes.fields.lookup import plane_features_gpu, plane_features_reference
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 from xplanes.files import read_json, require_writable, write_json, write_rows, write_text
-from xplanes.lrm.bundled import load_bundled
+from xplanes.lrm.weights import load_bundled
 from xplanes.rendering.compositing import composite_gpu, composite_reference
-from xplanes.rendering.marching import Rays, Samples, march_gpu, march_into
+from xplanes.rendering.marching import Rays, Samples, march_gpu, march_reference
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.batches import DeviceBatches
 
@@ -396,7 +396,7 @@ def marching_case(rays: int, device: torch.device) -> tuple[Callable[[], Samples
     def call(function: Callable[..., Samples]) -> Callable[[], Samples]:
         return lambda: function(given, grid, room=PLACES * rays, **options)
 
-    return call(march_gpu), call(march_into)
+    return call(march_gpu), call(march_reference)
 
 
 def measure_marching(record: Record, part: "Part", args: argparse.Namespace) -> None:

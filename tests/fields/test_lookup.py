@@ -13,7 +13,6 @@ from xplanes.backend import threads
 from xplanes.fields import lookup
 from xplanes.fields import lookup_numba as cpu
 from xplanes.fields.lookup import (
-    add_plane_features,
     plane_features,
     plane_features_gpu,
     plane_features_reference,
@@ -100,8 +99,7 @@ def test_further_planes_are_added_to_the_first_channels(dtype, asks, monkeypatch
         leaves = [
             p.clone().requires_grad_(asked) for p, asked in zip((coarse, fine), asks, strict=True)
         ]
-        features = plane_features(leaves[0], None, points, times, ())
-        found = add_plane_features(features, leaves[1], points)
+        found = plane_features(leaves[0], None, points, times, (), leaves[1])
         upstream = torch.linspace(-1, 1, found.numel(), dtype=dtype).view_as(found)
         asked = [leaf for leaf in leaves if leaf.requires_grad]
         return [found.detach(), *torch.autograd.grad((found * upstream).sum(), asked)]

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from tests.balls import ball_views, inside_ball, surrounding, swinging
-from xplanes.rendering.carving import carve
 from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.pruning import carve
 from xplanes.scenes.frame import Frame, cube_frame
 
 ORIGIN = torch.zeros(3)

@@ -7,10 +7,10 @@ import torch
 
 from tests.balls import ball_views, inside_ball, swinging
 from tests.rendering.test_carving import allowed_at
-from xplanes.rendering import filling
-from xplanes.rendering.filling import fill
+from xplanes.rendering import pruning
 from xplanes.rendering.marching import march
 from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.pruning import fill
 from xplanes.scenes.frame import cube_frame
 
 FRAME = cube_frame(1.4, torch.zeros(3))
@@ -59,7 +59,7 @@ def test_a_field_that_shows_all_leaves_its_own_cells_and_few_around():
 def test_rays_may_march_in_groups(monkeypatch):
     views = ball_views(6, 0.5, size=24)
     whole = filled(views, ball_field(0.3, static))
-    monkeypatch.setattr(filling, "RAYS", 50)
+    monkeypatch.setattr(pruning, "RAYS", 50)
     grouped = filled(views, ball_field(0.3, static))
     assert torch.equal(grouped.occupied, whole.occupied)
     assert torch.equal(grouped.density, whole.density)
@@ -75,10 +75,10 @@ def test_few_rays_find_the_cells_that_rays_through_all_pixels_find(monkeypatch, 
         rays.append(len(given.origins))
         return march(given, *rest, **named)
 
-    monkeypatch.setattr(filling, "march", counted)
+    monkeypatch.setattr(pruning, "march", counted)
     few = filled(views, ball_field(shown, static), resolution=12)
     spent, rays[:] = sum(rays), []
-    monkeypatch.setattr(filling, "pixels_of_a_cell", lambda *_: 1)
+    monkeypatch.setattr(pruning, "pixels_of_a_cell", lambda *_: 1)
     every = filled(views, ball_field(shown, static), resolution=12)
     assert (few.occupied != every.occupied).sum() <= 0.001 * every.occupied.sum()
     assert spent < 0.5 * sum(rays)
@@ -88,14 +88,14 @@ def test_a_cell_is_as_wide_as_it_looks_at_the_far_end_of_the_cube():
     views = ball_views(1, 0.5, size=400, distance=4.0)
     corner = 4.0 + 1.4 * math.sqrt(3)
     wide = float(views.intrinsics.focal[0, 0]) * 2.8 / 20 / corner
-    assert filling.pixels_of_a_cell(views, 0, FRAME, 20) == math.floor(wide) > 5
-    assert filling.pixels_of_a_cell(views, 0, FRAME, 2000) == 1
+    assert pruning.pixels_of_a_cell(views, 0, FRAME, 20) == math.floor(wide) > 5
+    assert pruning.pixels_of_a_cell(views, 0, FRAME, 2000) == 1
 
 
 @pytest.mark.parametrize("side", [1, 3, 4])
 def test_each_square_of_a_mask_has_one_pixel(side):
     mask = torch.rand(10, 13, generator=torch.Generator().manual_seed(0)) < 0.2
-    pixels = filling.one_of_each_square(mask, side)
+    pixels = pruning.one_of_each_square(mask, side)
     assert mask[tuple(pixels.T)].all()
     squares = {tuple(square) for square in (pixels // side).tolist()}
     assert len(squares) == len(pixels)

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from tests.oracles import march as oracle
 from tests.oracles import ray_box
-from xplanes.rendering.marching import Rays, march, march_gpu, march_into, march_reference
+from xplanes.rendering.marching import Rays, march, march_gpu, march_reference
 from xplanes.rendering.occupancy import OccupancyGrid
 
 try:
@@ -70,7 +70,7 @@ def twin(rays, grid, **options):
 
 
 def into(rays, grid, room, **options):
-    return march_into(Rays(*rays), grid, room=room, **details(grid, **options))
+    return march_reference(Rays(*rays), grid, room=room, **details(grid, **options))
 
 
 def by_kernel(rays, grid, room=None, **options):

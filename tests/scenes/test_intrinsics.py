@@ -24,9 +24,8 @@ from tests.scenes.common import (
 )
 from xplanes.baselines.tineuvox.model import frusta_box
 from xplanes.preparation.fixed_view import check_camera
-from xplanes.rendering.carving import carve
-from xplanes.rendering.filling import fill
 from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.pruning import carve, fill
 from xplanes.scenes.batches import RayBatches
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.frame import cube_frame, scene_frame

@@ -10,8 +10,8 @@ import torch.nn.functional as F
 
 from tests.balls import ball_views
 from tests.scenes.common import stored
-from xplanes.rendering.carving import carve
 from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.pruning import carve
 from xplanes.scenes.batches import RayBatches
 from xplanes.scenes.datamodule import UNIFORM
 from xplanes.scenes.frame import scene_frame

@@ -13,12 +13,22 @@ from torch import Tensor
 _BLOCK_ELEMENTS = {"cpu": 1 << 20, "cuda": 1 << 27}
 _SINGLE_PRECISION_ERROR = 3e-9
 _NARROW_FROM_COLUMNS = 96
-_WARM_UP = 10
-_WARM_STEP = 3.0
 _LARGEST = 1e6
 _SPARSE_FLOOR = 0.05
 _CHECK_EVERY = 4
 CHANGE_OVER_TOLERANCE = 10.0
+
+# The adaptive penalty: these values minimise the iterations on matrices like LRM features.
+_RELAXATION = 1.6
+"""Over-relaxation of the low-rank part; 1 is plain ADMM."""
+_WARM_UP, _WARM_STEP = 10, 3.0
+"""Iterations that set the penalty from the norms, and largest factor on it in one of them."""
+_RATIO = 1.5
+"""Target of ``penalty * |S| / |multiplier|`` in these iterations."""
+_GROWTH = 1.2
+"""Factor on the penalty per iteration afterwards, when it grows."""
+_GROW_ABOVE, _SHRINK_BELOW = 0.35, 0.02
+"""Grow or shrink while relative residual over relative change is above or below these."""
 
 
 def block_rows(matrix: Tensor) -> int:
@@ -215,35 +225,6 @@ def _squared(block: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Schedule:
-    """Schedule of the penalty, and over-relaxation.
-
-    The adaptive values minimise the number of iterations on matrices like LRM features.
-
-    Attributes:
-        relaxation: Over-relaxation of the low-rank part; 1 is plain ADMM.
-        growth: Factor on the penalty per iteration when it grows.
-        adaptive: Set the penalty from the iterates for ten iterations, then balance it.
-        ratio: Initial target of ``penalty * |S| / |multiplier|``.
-        grow_above: Grow while relative residual over relative change is above this.
-        shrink_below: Shrink while it is below this.
-    """
-
-    relaxation: float = 1.0
-    growth: float = 1.0
-    adaptive: bool = False
-    ratio: float = 1.5
-    grow_above: float = 0.35
-    shrink_below: float = 0.02
-
-
-SCHEDULES = {
-    "adaptive": Schedule(relaxation=1.6, growth=1.2, adaptive=True),
-    "admm": Schedule(),
-}
-
-
-@dataclass(frozen=True)
 class Norms:
     """Frobenius norms after an iteration.
 
@@ -266,17 +247,14 @@ class Penalty:
     A pass prepares the next one, so its measurements change the penalty of the pass after that.
     """
 
-    def __init__(self, schedule: Schedule, start: float, norm: float) -> None:
+    def __init__(self, start: float, norm: float, *, adaptive: bool) -> None:
         self.before = self.now = self.after = start
-        self._schedule = schedule
-        self._norm = norm
-        self._rate = 1.0
-        self._growth = schedule.growth
-        self._direction = 0
+        self._norm, self._adaptive = norm, adaptive
+        self._rate, self._growth, self._direction = 1.0, _GROWTH, 0
 
     def warm(self, iteration: int) -> bool:
         """Whether the penalty is still set from the norms of the iterates."""
-        return self._schedule.adaptive and iteration <= _WARM_UP
+        return self._adaptive and iteration <= _WARM_UP
 
     def relative(self, norms: Norms) -> tuple[float, float]:
         """Residual relative to the sparse part, and change relative to the multiplier.
@@ -296,13 +274,13 @@ class Penalty:
             norms: Norms of the last iteration.
             feasible: Whether the residual is far below the tolerance (growth has no benefit).
         """
-        if not self._schedule.adaptive or self.warm(iteration):
+        if not self._adaptive or self.warm(iteration):
             return
         primal, dual = self.relative(norms)
         direction = 0
-        if primal > self._schedule.grow_above * dual and not feasible:
+        if primal > _GROW_ABOVE * dual and not feasible:
             direction = 1
-        elif primal < self._schedule.shrink_below * dual:
+        elif primal < _SHRINK_BELOW * dual:
             direction = -1
         if direction * self._direction < 0:
             self._growth = math.sqrt(self._growth)
@@ -314,7 +292,7 @@ class Penalty:
         self.before, self.now = self.now, self.after
         if self.warm(iteration):
             sparse = max(norms.sparse, _SPARSE_FLOOR * self._norm)
-            target = self._schedule.ratio * self.before * norms.multiplier / sparse
+            target = _RATIO * self.before * norms.multiplier / sparse
             self.after = min(max(target, self.now / _WARM_STEP), self.now * _WARM_STEP)
         elif self._rate != 1:
             self.after = min(self.now * self._rate, max(self.now, _LARGEST / self._norm))
@@ -347,10 +325,10 @@ def minimise(
     *,
     sparsity_weight: float,
     penalty: float,
-    schedule: Schedule,
+    adaptive: bool,
     tolerance: float,
     max_iterations: int,
-    on_iteration: Callable[[Progress], None] | None = None,
+    on_iteration: Callable[[Progress], None],
 ) -> Progress:
     """Minimise ``|L|_* + sparsity_weight |S|_1`` subject to ``L + S = Y`` into the given outputs.
 
@@ -360,9 +338,10 @@ def minimise(
         sparse: Output S; stores the state during the iterations. [M, T]
         sparsity_weight: Weight of the sparse part.
         penalty: Penalty of the first pass, absolute.
-        schedule: Schedule of the penalty.
-        tolerance: Stop when the residual is below this and, for an adaptive schedule, the change
-            below ten times this.
+        adaptive: Over-relax, set the penalty from the iterates for ten iterations, then balance it
+            between residual and change; otherwise it is constant.
+        tolerance: Stop when the residual is below this and, if adaptive, the change below ten times
+            this.
         max_iterations: Maximum number of passes, at least 1.
         on_iteration: Called after each pass.
 
@@ -373,7 +352,7 @@ def minimise(
     gram = start(work)
     norm = gram.trace().sqrt().item()
     single = matrix.dtype == torch.float32
-    path = Penalty(schedule, penalty, norm)
+    path = Penalty(penalty, norm, adaptive=adaptive)
     progress = Progress()
     last = max_iterations == 1
     while True:
@@ -388,13 +367,12 @@ def minimise(
             limit=sparsity_weight / path.now,
             rescale=path.before / path.now,
             next_rescale=path.now / path.after,
-            relaxation=schedule.relaxation,
+            relaxation=_RELAXATION if adaptive else 1.0,
             double=not single or needs_double(singular[-1].item(), 1 / path.after, tolerance),
         )
         if last:
             finish(work, low_rank, step)
-            if on_iteration:
-                on_iteration(progress)
+            on_iteration(progress)
             return progress
 
         check = progress.iterations % _CHECK_EVERY == 0
@@ -406,9 +384,8 @@ def minimise(
             feasible = progress.residual <= 0.1 * tolerance
             path.balance(progress.iterations, norms, feasible=feasible)
             last = progress.residual <= tolerance
-            if schedule.adaptive:
+            if adaptive:
                 last = last and progress.change <= CHANGE_OVER_TOLERANCE * tolerance
         last = last or progress.iterations >= max_iterations - 1
         path.advance(progress.iterations, norms)
-        if on_iteration:
-            on_iteration(progress)
+        on_iteration(progress)

@@ -13,14 +13,13 @@ from tqdm import tqdm
 
 from xplanes.decomposition.admm import (
     CHANGE_OVER_TOLERANCE,
-    SCHEDULES,
     Progress,
     block_rows,
     minimise,
 )
 from xplanes.fields.xplanes import SPACE_PLANES
 
-METHODS = tuple(SCHEDULES)
+METHODS = ("adaptive", "admm")
 SCALES = ("rms", "none")
 
 
@@ -161,7 +160,7 @@ def robust_pca(
                 penalty=penalty * math.sqrt(work.numel()) / _norm(work)
                 if adaptive
                 else penalty / unit,
-                schedule=SCHEDULES[method],
+                adaptive=adaptive,
                 tolerance=tolerance,
                 max_iterations=max_iterations,
                 on_iteration=show,

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from xplanes.decomposition.conversion import frame_profiles
+from xplanes.fields.lookup import Rows
 from xplanes.scenes.views import spread
-
-Rows = Sequence[tuple[int, int]]
 
 REDUCTIONS = ("mean", "sum")
 

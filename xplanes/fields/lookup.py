@@ -37,7 +37,12 @@ def time_plane_axes(rows: Rows) -> list[int]:
 
 
 def plane_features(
-    space: Tensor, time: Tensor | None, points: Tensor, times: Tensor, rows: Rows
+    space: Tensor,
+    time: Tensor | None,
+    points: Tensor,
+    times: Tensor,
+    rows: Rows,
+    fine: Tensor | None = None,
 ) -> Tensor:
     """Features of Eq. 15: each space plane plus the product of its two time planes.
 
@@ -50,6 +55,8 @@ def plane_features(
         points: Positions in the field's frame. [N, 3]
         times: Times from 0 to 1. [N]
         rows: For each space plane, the two time planes that are multiplied.
+        fine: Further planes xy, xz, yz that are added to the first channels, C' <= C.
+            [3, F, F, C']
 
     Returns:
         One feature vector per space plane. [N, 3, C]
@@ -57,30 +64,16 @@ def plane_features(
     Source: X-Planes, Eq. 15.
     """
     if cpu_loops(space):
-        return _Features.apply(space, time, points, times, rows)  # type: ignore[return-value]
+        return _Features.apply(space, time, fine, points, times, rows)  # type: ignore[return-value]
+    if fine is not None:
+        found = plane_features(space, time, points, times, rows)
+        further = plane_features(fine, None, points, times, ())
+        return found + F.pad(further, (0, space.shape[3] - fine.shape[3]))
     if gpu_kernels(space) and _kernels_hold(
         space.device, space.dtype, space.shape[3], rows if time is not None else ()
     ):
         return plane_features_gpu(space, time, points, times, rows)
     return plane_features_reference(space, time, points, times, rows)
-
-
-def add_plane_features(features: Tensor, space: Tensor, points: Tensor) -> Tensor:
-    """Add features of space planes with fewer channels to the first channels.
-
-    Args:
-        features: Overwritten on the CPU, so that no earlier operation may have saved them for its
-            gradient. [N, 3, C]
-        space: Planes xy, xz, yz, C' <= C. [3, H, H, C']
-        points: Positions in the field's frame. [N, 3]
-
-    Returns:
-        The sum; gradients reach both terms. [N, 3, C]
-    """
-    if cpu_loops(space) and features.dtype == space.dtype:
-        return _Onto.apply(features, space, points)  # type: ignore[return-value]
-    further = plane_features(space, None, points, torch.zeros_like(points[:, 0]), ())
-    return features + F.pad(further, (0, features.shape[2] - space.shape[3]))
 
 
 def plane_features_reference(
@@ -120,7 +113,13 @@ def plane_features_gpu(
 class _Features(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, space: Tensor, time: Tensor | None, points: Tensor, times: Tensor, rows: Rows
+        ctx: Any,
+        space: Tensor,
+        time: Tensor | None,
+        fine: Tensor | None,
+        points: Tensor,
+        times: Tensor,
+        rows: Rows,
     ) -> Tensor:
         cpu = compiled("xplanes.fields.lookup_numba")
         moving = space.new_zeros(0, 1, 1, space.shape[3]) if time is None else time
@@ -131,8 +130,10 @@ class _Features(torch.autograd.Function):
         features = space.new_empty(count, 3, channels)
         factors = space.new_empty(count, len(moving), channels)
         cpu.gather(*_arrays(space, moving, points, times, pairs, axes), *_arrays(features, factors))
+        if fine is not None:
+            cpu.gather_onto(*_arrays(fine, points, features))
         ctx.save_for_backward(points, times, pairs, axes, factors)
-        ctx.shapes = (space.shape, moving.shape)
+        ctx.shapes = (space.shape, moving.shape, None if fine is None else fine.shape)
         return features
 
     @staticmethod
@@ -143,49 +144,20 @@ class _Features(torch.autograd.Function):
         cpu = compiled("xplanes.fields.lookup_numba")
         points, times, pairs, axes, factors = ctx.saved_tensors
         gradient = gradients[0].to(factors.dtype).contiguous()
-        space = time = None
-        if ctx.needs_input_grad[0]:
-            space = _space_gradient(points, gradient, ctx.shapes[0])
-        if ctx.needs_input_grad[1]:
-            time = gradient.new_zeros(ctx.shapes[1])
+        space, time, fine = (
+            gradient.new_zeros(shape) if asked else None
+            for shape, asked in zip(ctx.shapes, ctx.needs_input_grad, strict=False)
+        )
+        for planes in (space, fine):
+            if planes is not None:
+                tasks = cpu.tasks_a_plane(len(planes))
+                cpu.scatter_space(*_arrays(points, gradient), tasks, *_arrays(planes))
+        if time is not None:
             spread = torch.empty_like(factors)
             cpu.product_gradients(*_arrays(pairs, gradient, factors, spread))
             tasks = cpu.tasks_a_plane(len(time))
             cpu.scatter_time(*_arrays(points, times, axes, spread), tasks, *_arrays(time))
-        return space, time, None, None, None
-
-
-class _Onto(torch.autograd.Function):
-    """Adds to the first channels; autograd's own slices would copy the whole gradient twice."""
-
-    @staticmethod
-    def forward(ctx: Any, features: Tensor, space: Tensor, points: Tensor) -> Tensor:
-        cpu = compiled("xplanes.fields.lookup_numba")
-        points = points.to(space.dtype).contiguous()
-        cpu.gather_onto(*_arrays(space, points, features))
-        ctx.mark_dirty(features)
-        ctx.save_for_backward(points)
-        ctx.shape = space.shape
-        return features
-
-    @staticmethod
-    @once_differentiable
-    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx: Any, *gradients: Tensor
-    ) -> tuple[Tensor | None, ...]:
-        if not ctx.needs_input_grad[1]:
-            return gradients[0], None, None
-        (points,) = ctx.saved_tensors
-        return gradients[0], _space_gradient(points, gradients[0].contiguous(), ctx.shape), None
-
-
-def _space_gradient(points: Tensor, gradient: Tensor, shape: torch.Size) -> Tensor:
-    """Gradient of space planes from that of the features' first channels. [3, H, H, C']"""
-    cpu = compiled("xplanes.fields.lookup_numba")
-    space = gradient.new_zeros(shape)
-    tasks = cpu.tasks_a_plane(len(space))
-    cpu.scatter_space(*_arrays(points, gradient), tasks, *_arrays(space))
-    return space
+        return space, time, fine, None, None, None
 
 
 class _Kernels(torch.autograd.Function):

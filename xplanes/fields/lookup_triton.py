@@ -160,30 +160,6 @@ def upstream_of(gradient, n, count, channel, ROW: tl.constexpr, CHANNELS: tl.con
     return tl.load(gradient + offset, mask=mask, other=0.0)
 
 
-@triton.jit
-def row_backward(
-    time,
-    source,
-    line,
-    across,
-    down,
-    time_gradient,
-    timesteps,
-    width,
-    channel,
-    FIRST: tl.constexpr,
-    SECOND: tl.constexpr,
-    CHANNELS: tl.constexpr,
-):
-    """Gradients of the two time planes of one row."""
-    first = read(time, FIRST * timesteps, width, line, across, channel, CHANNELS)
-    second = read(time, SECOND * timesteps, width, line, down, channel, CHANNELS)
-    step = FIRST * timesteps
-    spread(time_gradient, step, width, line, across, source * second, channel, CHANNELS)
-    step = SECOND * timesteps
-    spread(time_gradient, step, width, line, down, source * first, channel, CHANNELS)
-
-
 @triton.jit(do_not_specialize=SIZES)
 def backward_by_row(
     time,
@@ -216,20 +192,12 @@ def backward_by_row(
             if SPACE:
                 column, row = space_taps(a, size), space_taps(b, size)
                 spread(space_gradient, r * size, size, row, column, source, channel, CHANNELS)
-            row_backward(
-                time,
-                source,
-                line,
-                space_taps(a, width),
-                space_taps(b, width),
-                time_gradient,
-                timesteps,
-                width,
-                channel,
-                ROWS[r][0],
-                ROWS[r][1],
-                CHANNELS,
-            )
+            across, down = space_taps(a, width), space_taps(b, width)
+            start, end = ROWS[r][0] * timesteps, ROWS[r][1] * timesteps
+            first = read(time, start, width, line, across, channel, CHANNELS)
+            second = read(time, end, width, line, down, channel, CHANNELS)
+            spread(time_gradient, start, width, line, across, source * second, channel, CHANNELS)
+            spread(time_gradient, end, width, line, down, source * first, channel, CHANNELS)
 
 
 @triton.jit(do_not_specialize=SIZES)

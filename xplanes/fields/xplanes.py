@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from xplanes.fields.background import Background
 from xplanes.fields.base import RadianceField
 from xplanes.fields.decoder import Decoder
-from xplanes.fields.lookup import Rows, add_plane_features, plane_features
+from xplanes.fields.lookup import Rows, plane_features
 
 PLANE_SETS: dict[str, Rows] = {
     "three": (),
@@ -161,10 +161,8 @@ class XPlanes(RadianceField):
 
     def features(self, points: Tensor, times: Tensor) -> Tensor:
         """Input of the decoder. [N, 3], [N] -> [N, 3 C]"""
-        found = plane_features(self.space, self.time, points, times, self.rows)
-        if self.fine is not None and self.is_fine:
-            found = add_plane_features(found, self.fine, points)
-        return found.flatten(1)
+        fine = self.fine if self.is_fine else None
+        return plane_features(self.space, self.time, points, times, self.rows, fine).flatten(1)
 
     def forward(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
         """Colour and density at points and times.

@@ -14,12 +14,11 @@ from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.behind import behind
 from xplanes.rendering.box import Field, ray_box, shade
-from xplanes.rendering.carving import carve
 from xplanes.rendering.compositing import composite, distortion
-from xplanes.rendering.filling import fill
 from xplanes.rendering.front_to_back import front_to_back
 from xplanes.rendering.marching import Rays, march
 from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.pruning import carve, fill
 from xplanes.rendering.sampler import VIEWS_PER_ROW, Sampler, SamplerSettings, Site
 from xplanes.rendering.thinning import thinned
 from xplanes.rendering.warming import render_one_ray
@@ -284,11 +283,10 @@ class OccupancySettings(SamplerSettings):
 
     def build(self, field: RadianceField, site: Site) -> "OccupancySampler":
         constant = getattr(field, "background", None) is None
-        if self.samples == "auto":
-            least, most = FEWEST_SAMPLES, 2 * FEWEST_SAMPLES if constant else FEWEST_SAMPLES
-            samples = min(max(round(SAMPLES_PER_PIXEL * site.pixels), least), most)
-            return replace(self, samples=samples).build(field, site)
         along = self.samples
+        if along == "auto":
+            least, most = FEWEST_SAMPLES, 2 * FEWEST_SAMPLES if constant else FEWEST_SAMPLES
+            along = min(max(round(SAMPLES_PER_PIXEL * site.pixels), least), most)
         grid = OccupancyGrid(
             self.grid_resolution,
             self.bins(site.times),

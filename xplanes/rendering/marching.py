@@ -12,7 +12,7 @@ from torch import Tensor
 
 from xplanes.backend import compiled, cpu_loops, gpu_kernels, proven, waves
 from xplanes.rendering.box import ray_box
-from xplanes.rendering.compositing import OPAQUE, depth_before
+from xplanes.rendering.compositing import OPAQUE
 from xplanes.rendering.occupancy import OccupancyGrid
 
 OUTSIDE = 3.0
@@ -113,9 +113,9 @@ def march(
         return _march_cpu(rays, grid, step=step, occupied=occupied, limit=limit)
     if gpu_kernels(origins) and _kernels_hold(origins.device, origins.dtype):
         return march_gpu(rays, grid, step=step, occupied=occupied, limit=limit, room=room)
-    if room is not None and origins.device.type != "cpu":
-        return march_into(rays, grid, step=step, occupied=occupied, limit=limit, room=room)
-    return march_reference(rays, grid, step=step, occupied=occupied, limit=limit)
+    if origins.device.type == "cpu":
+        room = None
+    return march_reference(rays, grid, step=step, occupied=occupied, limit=limit, room=room)
 
 
 def march_reference(
@@ -125,38 +125,18 @@ def march_reference(
     step: float,
     occupied: Tensor | None,
     limit: float,
+    room: int | None = None,
 ) -> Samples:
-    """Reference implementation of `march`, in whole-tensor operations."""
-    origins, directions, *_ = rays
-    near, far = ray_box(origins, directions)
-    steps = int(((far - near).max() / step).ceil()) + 1 if len(near) else 0
-    distances, cells, inside = _all_samples(rays, near, far, grid, step, steps)
-    live = inside if occupied is None else inside & occupied[cells]
-    ray, place = live.nonzero(as_tuple=True)
-    distances, cells = distances[ray, place], cells[ray, place]
-    candidates, found = int(inside.sum()), len(ray)
-    if math.isfinite(limit) and found:
-        depth = (grid.least[cells].double() * step).clamp_max(OPAQUE)
-        depth = depth_before(depth, ray, _starts(ray, len(near)))
-        visible = (depth < limit).nonzero()[:, 0]
-        ray, distances, cells = ray[visible], distances[visible], cells[visible]
-    return Samples(
-        ray=ray,
-        starts=_starts(ray, len(near)),
-        points=torch.addcmul(origins[ray], directions[ray], distances[:, None]),
-        distances=distances,
-        cells=cells,
-        candidates=candidates,
-        empty=candidates - found,
-        occluded=found - len(ray),
-    )
+    """Reference implementation of `march`, in whole-tensor operations.
 
-
-def _all_samples(
-    rays: Rays, near: Tensor, far: Tensor, grid: OccupancyGrid, step: float, steps: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Distances and cells of each ray's samples, and whether they are in the cube. [R, S]"""
+    With a fixed number of slots, nothing waits for the device: each slot finds its sample by a
+    binary search in the cumulative number of samples.
+    """
     origins, directions, times, jitter = rays
+    near, far = ray_box(origins, directions)
+    count, steps = len(near), math.ceil(2 * math.sqrt(3) / step) + 1
+    if room is None and count:
+        steps = int(((far - near).max() / step).ceil()) + 1
     offset = torch.arange(steps, device=near.device, dtype=near.dtype) + jitter[:, None]
     distances = near[:, None] + offset * step
     half = 0.5 * grid.resolution
@@ -164,51 +144,41 @@ def _all_samples(
     for axis in (2, 1, 0):
         place = (origins[:, axis, None] + distances * directions[:, axis, None] + 1) * half
         cells = cells * grid.resolution + place.long().clamp_(0, grid.resolution - 1)
-    return distances, cells, distances < far[:, None]
-
-
-def march_into(
-    rays: Rays,
-    grid: OccupancyGrid,
-    *,
-    step: float,
-    occupied: Tensor | None,
-    limit: float,
-    room: int,
-) -> Samples:
-    """`march_reference` with a fixed number of slots, without waiting for the device.
-
-    Each slot finds its sample by a binary search in the cumulative number of samples.
-    """
-    origins, directions, *_ = rays
-    near, far = ray_box(origins, directions)
-    count, steps = len(near), math.ceil(2 * math.sqrt(3) / step) + 1
-    distances, cells, inside = _all_samples(rays, near, far, grid, step, steps)
+    inside = distances < far[:, None]
     met = inside if occupied is None else inside & occupied[cells]
     kept = met
     if math.isfinite(limit):
         depth = (grid.least[cells].double() * step).clamp_max(OPAQUE) * met
         kept = met & (depth.cumsum(1) - depth < limit)
-    running = kept.flatten().cumsum(0)
-    ends = running.view(count, steps)[:, -1]
-    shown = ends <= room
-    total = (ends * shown).amax()
-    slot = torch.arange(room, device=near.device)
-    live = slot < total
-    place = torch.searchsorted(running, slot + 1).clamp_max_(count * steps - 1)
-    ray = torch.where(live, torch.div(place, steps, rounding_mode="floor"), count - 1)
+    numbers = kept.sum(dim=1)
+    ends = numbers.cumsum(0)
+    starts, live, total, shown = ends - numbers, None, None, None
+    tally = torch.stack([inside.sum(), met.sum(), numbers.sum()])
+    candidates, found, left = tally if room is not None else tally.tolist()
+    if room is None:
+        place = kept.flatten().nonzero()[:, 0]
+    else:
+        shown = ends <= room
+        total = (ends * shown).amax()
+        slot = torch.arange(room, device=near.device)
+        starts, live = torch.minimum(starts, total), slot < total
+        running = kept.flatten().cumsum(0)
+        place = torch.searchsorted(running, slot + 1).clamp_max_(count * steps - 1)
+    ray = torch.div(place, steps, rounding_mode="floor")
     distances = distances.flatten()[place]
     points = torch.addcmul(origins[ray], directions[ray], distances[:, None])
-    candidates, found = inside.sum(), met.sum()
+    if live is not None:
+        ray, distances = torch.where(live, ray, count - 1), torch.where(live, distances, 0)
+        points = torch.where(live[:, None], points, OUTSIDE)
     return Samples(
         ray=ray,
-        starts=torch.minimum(ends - kept.sum(dim=1), total),
-        points=torch.where(live[:, None], points, OUTSIDE),
-        distances=torch.where(live, distances, 0),
+        starts=starts,
+        points=points,
+        distances=distances,
         cells=cells.flatten()[place],
         candidates=candidates,
         empty=candidates - found,
-        occluded=found - running[-1],
+        occluded=found - left,
         live=live,
         number=total,
         shown=shown,
@@ -224,7 +194,7 @@ def march_gpu(
     limit: float,
     room: int | None,
 ) -> Samples:
-    """`march_into`, or `march_reference` if ``room`` is None, as a Triton kernel.
+    """`march_reference` as a Triton kernel.
 
     The kernel runs twice: to count the samples of each ray, and to write them.
     """
@@ -292,13 +262,7 @@ def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
             found.points[here],
         ]
 
-    return proven(f"marching ({dtype})", device, attempt, march_gpu, march_into, dtype)
-
-
-def _starts(ray: Tensor, rays: int) -> Tensor:
-    """Index of each ray's first sample. [N] -> [rays]"""
-    # Unlike ``bincount``, a binary search does not wait for the device.
-    return torch.searchsorted(ray, torch.arange(rays, device=ray.device))
+    return proven(f"marching ({dtype})", device, attempt, march_gpu, march_reference, dtype)
 
 
 def _march_cpu(
@@ -313,20 +277,19 @@ def _march_cpu(
     near, far = ray_box(rays.origins, rays.directions)
     half = 0.5 * grid.resolution
     origins, directions = rays.origins.contiguous(), rays.directions.contiguous()
-    inputs = (origins, directions, (origins + 1) * half, directions * half)
-    inputs = (*inputs, grid.bins(rays.times), near, rays.jitter.contiguous())
+    line = (origins, directions)
+    way = ((origins + 1) * half, directions * half, grid.bins(rays.times), near, rays.jitter)
+    line, way = (tuple(t.contiguous().numpy() for t in part) for part in (line, way))
     wanted = (grid.occupied if occupied is None else occupied).numpy()
-    ways = [t.numpy() for t in inputs]
-    cells_to_sample = (wanted, grid.resolution, occupied is not None)
+    chosen = (wanted, grid.resolution, occupied is not None)
     counts = torch.empty(3, len(near), dtype=torch.int64)
-    surfaces = (far.numpy(), grid.least.numpy(), limit)
-    cpu.count_samples(*ways[2:], step, *cells_to_sample, *surfaces, counts.numpy())
+    cpu.count_samples(way, step, chosen, far.numpy(), grid.least.numpy(), limit, counts.numpy())
     candidates, found, kept = counts.sum(dim=1).tolist()
     starts = counts[2].cumsum(0) - counts[2]
     ray, cells = torch.empty(2, kept, dtype=torch.int64)
     distances, points = origins.new_empty(kept), origins.new_empty(kept, 3)
     places = (starts, counts[2], ray, distances, cells, points)
-    cpu.fill_samples(*ways, step, *cells_to_sample, *(t.numpy() for t in places))
+    cpu.fill_samples(line, way, step, chosen, tuple(t.numpy() for t in places))
     return Samples(
         ray, starts, points, distances, cells, candidates, candidates - found, found - kept
     )

@@ -5,8 +5,6 @@ write them once the offsets of all rays are known. Both passes get the same numb
 fused multiply-add is disabled. Imported only when needed, since triton takes a while to load.
 """
 
-# ruff: noqa: D103 (the callers in marching.py document these kernels)
-
 import torch
 import triton
 import triton.language as tl
@@ -34,18 +32,13 @@ def slab(origin, direction):
 
 
 @triton.jit
-def load_ray(origins, directions, ray):
-    origin = (
-        tl.load(origins + 3 * ray),
-        tl.load(origins + 3 * ray + 1),
-        tl.load(origins + 3 * ray + 2),
+def load(vectors, ray):
+    """The three numbers of a ray."""
+    return (
+        tl.load(vectors + 3 * ray),
+        tl.load(vectors + 3 * ray + 1),
+        tl.load(vectors + 3 * ray + 2),
     )
-    direction = (
-        tl.load(directions + 3 * ray),
-        tl.load(directions + 3 * ray + 1),
-        tl.load(directions + 3 * ray + 2),
-    )
-    return origin, direction
 
 
 @triton.jit
@@ -62,24 +55,18 @@ def ray_box(origin, direction):
 
 
 @triton.jit
-def cells_of(
-    origin,
-    direction,
-    distance,
-    time_bin,
-    inside,
-    occupied,
-    size,
-    SKIP: tl.constexpr,
-):
+def index_of(origin, direction, distance, size):
+    """Index of the cells of positions on a ray, along one axis."""
+    return within((origin + distance * direction + 1) * (0.5 * size), size)
+
+
+@triton.jit
+def cells_of(origin, direction, distance, time_bin, inside, occupied, size, SKIP: tl.constexpr):
     """Cells of a block of positions on a ray, and whether samples are placed there."""
-    x, y, z = (
-        origin[0] + distance * direction[0] + 1,
-        origin[1] + distance * direction[1] + 1,
-        origin[2] + distance * direction[2] + 1,
-    )
-    column, row = within(x * (0.5 * size), size), within(y * (0.5 * size), size)
-    cell = ((time_bin * size + within(z * (0.5 * size), size)) * size + row) * size + column
+    x = index_of(origin[0], direction[0], distance, size)
+    y = index_of(origin[1], direction[1], distance, size)
+    z = index_of(origin[2], direction[2], distance, size)
+    cell = ((time_bin * size + z) * size + y) * size + x
     wanted = inside
     if SKIP:
         wanted = wanted & (tl.load(occupied + cell, mask=wanted, other=0) != 0)
@@ -129,7 +116,7 @@ def march(
 ):
     """Counts samples, or writes them if FILL; ``counts`` is [3, rays]."""
     ray = tl.program_id(0)
-    origin, direction = load_ray(origins, directions, ray)
+    origin, direction = load(origins, ray), load(directions, ray)
     near, far = ray_box(origin, direction)
     exact_step, limit = tl.load(step), tl.load(limit)
     spacing = exact_step.to(near.dtype)

@@ -281,14 +281,6 @@ class OccupancyGrid(nn.Module):
     def draw(self, cells: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Points and times in cells from uniform numbers. [N], [N, 4] -> [N, 3], [N]"""
         size = self.resolution
-        index = torch.stack(
-            [
-                cells % size,
-                torch.div(cells, size, rounding_mode="floor") % size,
-                torch.div(cells, size**2, rounding_mode="floor") % size,
-                torch.div(cells, size**3, rounding_mode="floor"),
-            ],
-            dim=-1,
-        )
-        place = index + uniform
+        index = [cells % size, cells // size % size, cells // size**2 % size, cells // size**3]
+        place = torch.stack(index, dim=-1) + uniform
         return place[:, :3] * (2 / size) - 1, place[:, 3] / self.time_bins

@@ -18,6 +18,7 @@ from xplanes.files import read_rows
 from xplanes.run import run
 from xplanes.tools.evaluate import evaluate
 from xplanes.tools.runs import load_run
+from xplanes.training.csv_logger import CSVLogger as OwnCSVLogger
 from xplanes.training.fit import Trainer
 
 PLAIN = {"accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False}
@@ -103,6 +104,20 @@ def test_a_resumed_run_goes_on_with_its_csv(scenes, tmp_path):
     assert steps("parts") == steps("whole") == [1, 3, 5, 7, 9, 11, 13]
     kept = rows(tmp_path / "parts")[: len(before)]
     assert [{k: row[k] for k in before[0]} for row in kept][:4] == before[:4]
+
+
+@pytest.mark.parametrize("rest", ["0.5,9", "0.5,,", "0.5,\0\0", "0.5,9,0.5,9"])
+def test_a_row_that_was_cut_off_does_not_end_the_csv(tmp_path, rest):
+    def log(step: int) -> None:
+        log = OwnCSVLogger(tmp_path, name="", version="csv")
+        log.log_metrics({"loss": 0.5, "train/loss": 0.5}, step)
+        log.save()
+
+    log(3)
+    with (tmp_path / "csv" / "metrics.csv").open("a") as file:
+        file.write(rest)
+    log(9)
+    assert [row["step"] for row in rows(tmp_path)] == ["3", "9"]
 
 
 def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(scenes, tmp_path, trained_run):

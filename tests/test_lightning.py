@@ -221,6 +221,27 @@ def test_gradients_are_clipped_and_accumulated(config, tmp_path):
     assert module.tally.last["loss"] > 0
 
 
+class BreaksOff(lightning.Callback):
+    """Notes learning rates, and fails in the first step."""
+
+    def __init__(self) -> None:
+        self.rates: list[float] = []
+
+    def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
+        self.rates.append(optimizer.param_groups[0]["lr"])
+        if len(self.rates) == 1:
+            raise RuntimeError("a fault of one's own")
+
+
+def test_a_fit_after_one_that_was_broken_off_begins_with_low_rates(config, tmp_path):
+    module, data, steps = RadianceModule(config), SceneDataModule(config["data"]), BreaksOff()
+    options = {"logger": False, "limit_val_batches": 0, "callbacks": [steps]}
+    with pytest.raises(RuntimeError, match="a fault of one's own"):
+        trainer(tmp_path, **options).fit(module, data)
+    trainer(tmp_path, **options | {"max_steps": 2}).fit(module, data)
+    assert steps.rates[0] == steps.rates[1] < steps.rates[2]
+
+
 def test_two_halves_of_a_batch_make_the_same_step_as_the_whole(config):
     """Each is half of the rays; the loss is a mean."""
     config = copy.deepcopy(config)

@@ -288,6 +288,8 @@ class RadianceModule(ViewScoring):
         callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
         self._schedules = [c for c in callbacks if isinstance(getattr(c, "progress", None), float)]
         self.method.require_devices(trainer.world_size)
+        # An earlier fit may have been interrupted within a step.
+        self.between_updates, self._losses, self._seen = True, [], None
 
     def on_train_start(self) -> None:
         if self.global_rank:  # What a checkpoint holds counts once, in the first process.

@@ -11,6 +11,7 @@ import pytest
 from lightning.pytorch import callbacks
 from lightning.pytorch.loggers import CSVLogger
 
+from tests.baselines.runs import TINEUVOX, baseline_config
 from tests.training.runs import checkpoint, metrics, small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError
@@ -62,6 +63,23 @@ def test_a_plain_trainer_that_scales_or_widens_numbers_is_refused(scenes):
     trainer = lightning.Trainer(max_steps=2, precision="64-true", logger=False, **PLAIN)
     with pytest.raises(ConfigError, match=r"precision=64-true.*model\.precision"):
         trainer.fit(module, data)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        ("model=tineuvox_reduced", *TINEUVOX),
+        ("model=gaussians_hexplane", "model.count=20", "model.resolution=8", "model.width=16"),
+    ],
+)
+def test_averages_of_weights_that_change_their_shapes_are_refused(model, scenes):
+    config = baseline_config(scenes, *model)
+    module, data = RadianceModule(config), SceneDataModule(config["data"])
+    average = callbacks.EMAWeightAveraging(use_buffers=False)
+    trainer = lightning.Trainer(max_steps=2, logger=False, callbacks=[average], **PLAIN)
+    with pytest.raises(ConfigError, match=r"callbacks: EMAWeightAveraging: .*Model .*leave it out"):
+        trainer.fit(module, data)
+    assert trainer.global_step == 0
 
 
 @pytest.mark.parametrize("precision", [None, 32, "32", "32-true"])

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor, nn
 
@@ -288,6 +289,12 @@ class RadianceModule(ViewScoring):
         callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
         self._schedules = [c for c in callbacks if isinstance(getattr(c, "progress", None), float)]
         self.method.require_devices(trainer.world_size)
+        for callback in callbacks if self.model.replaces_parameters else ():
+            if isinstance(callback, WeightAveraging):
+                raise ConfigError(
+                    f"callbacks: {type(callback).__name__}: {type(self.model).__name__} changes the "
+                    "shapes of its parameters in training, so that they have no mean; leave it out"
+                )
         # An earlier fit may have been interrupted within a step.
         self.between_updates, self._losses, self._seen = True, [], None
 

@@ -20,6 +20,7 @@ from xplanes.run import run
 from xplanes.tools.evaluate import evaluate
 from xplanes.tools.runs import load_run
 from xplanes.training.csv_logger import CSVLogger as OwnCSVLogger
+from xplanes.training.evaluation import Evaluation
 from xplanes.training.fit import Trainer
 
 PLAIN = {"accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False}
@@ -46,6 +47,10 @@ def rows(folder: Path) -> list[dict[str, str]]:
         ({"precision": "bf16-true"}, r"precision=bf16-true.*model\.precision"),
         ({"precision": "16-mixed"}, r"precision=16-mixed.*model\.precision"),
         ({"overfit_batches": 1}, r"overfit_batches=1.*data\.views"),
+        *(
+            ({name: 5, "callbacks": [Evaluation()]}, rf"{name}=5: .*callbacks\.evaluation\.at")
+            for name in ("val_check_interval", "check_val_every_n_epoch", "num_sanity_val_steps")
+        ),
         (
             {"callbacks": [callbacks.StochasticWeightAveraging(0.1)]},
             r"StochasticWeightAveraging.*EMAWeightAveraging",

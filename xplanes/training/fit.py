@@ -34,6 +34,10 @@ from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore
 
 
+WHEN = ("val_check_interval", "check_val_every_n_epoch", "num_sanity_val_steps")
+"""Arguments of Lightning's Trainer that say when to validate."""
+
+
 class Trainer(lightning.Trainer):
     """Lightning's Trainer with a limit in seconds and a check of the devices.
 
@@ -80,6 +84,11 @@ class Trainer(lightning.Trainer):
                 raise ConfigError(
                     f"callbacks: {type(callback).__name__}: the model's schedules would override "
                     "its learning rates; use lightning.pytorch.callbacks.EMAWeightAveraging"
+                )
+            if isinstance(callback, Evaluation) and (name := next(filter(others.get, WHEN), None)):
+                raise ConfigError(
+                    f"{name}={others[name]}: Evaluation chooses when to validate; set "
+                    "callbacks.evaluation.at, shares of the budget"
                 )
         device = find_device(accelerator)
         if device.type == "cuda":

@@ -62,11 +62,18 @@ def test_what_would_train_wrongly_is_refused(options, words):
         Trainer(max_steps=2, **PLAIN, **options)
 
 
-def test_a_plain_trainer_that_scales_or_widens_numbers_is_refused(scenes):
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"precision": "64-true"}, r"precision=64-true.*model\.precision"),
+        ({"overfit_batches": 1}, r"overfit_batches=1.*data\.views"),
+    ],
+)
+def test_a_plain_trainer_that_would_train_wrongly_is_refused(options, words, scenes):
     config = small_config(scenes)
     module, data = RadianceModule(config), SceneDataModule(config["data"])
-    trainer = lightning.Trainer(max_steps=2, precision="64-true", logger=False, **PLAIN)
-    with pytest.raises(ConfigError, match=r"precision=64-true.*model\.precision"):
+    trainer = lightning.Trainer(max_steps=2, logger=False, **PLAIN, **options)
+    with pytest.raises(ConfigError, match=words):
         trainer.fit(module, data)
 
 

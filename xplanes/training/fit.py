@@ -23,7 +23,7 @@ from xplanes.scenes.batches import Batch
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Scene
 from xplanes.settings import Count, Positive, Steps
-from xplanes.training.building import require_whole_floats
+from xplanes.training.building import require_new_rays, require_whole_floats
 from xplanes.training.checkpoints import AtomicCheckpointIO, Checkpoints, find_resumable
 from xplanes.training.clock import TrainingClock, find_callback
 from xplanes.training.collapse import CollapseWatch
@@ -73,11 +73,7 @@ class Trainer(lightning.Trainer):
     ) -> None:
         if max_seconds is not None and not max_seconds > 0:
             raise ConfigError(f"max_seconds={max_seconds}: must be above 0, or null for no limit")
-        if others.get("overfit_batches", 0) != 0:
-            raise ConfigError(
-                f"overfit_batches={others['overfit_batches']}: rays are drawn again at each step; "
-                "leave it out, and set data.views to train on few images"
-            )
+        require_new_rays(others.get("overfit_batches", 0))
         require_whole_floats(str(others.get("precision") or "32-true"))
         for callback in callbacks:
             if isinstance(callback, StochasticWeightAveraging):

@@ -32,6 +32,7 @@ from xplanes.training.building import (
     build_parts,
     parts_from,
     require_frame,
+    require_new_rays,
     require_version,
     require_whole_floats,
     site_content,
@@ -152,6 +153,7 @@ class RadianceModule(ViewScoring):
 
     def setup(self, stage: str) -> None:
         require_whole_floats(str(self.trainer.precision))
+        require_new_rays(self.trainer.overfit_batches)  # type: ignore[attr-defined]
 
     def configure_model(self) -> None:
         # Loaded without a Trainer, the field is built in `on_load_checkpoint`.

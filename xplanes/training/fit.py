@@ -33,7 +33,6 @@ from xplanes.training.losses import loss_terms
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore
 
-
 WHEN = ("val_check_interval", "check_val_every_n_epoch", "num_sanity_val_steps")
 """Arguments of Lightning's Trainer that say when to validate."""
 
@@ -49,6 +48,7 @@ class Trainer(lightning.Trainer):
         deterministic: Bit-identical runs; CPU only, with a budget in steps.
         tf32: On GPUs, multiply float32 matrices in TF32 (10-bit mantissa), which is faster.
         log_every_n_steps: Steps between log entries; 0 for none.
+        accumulate_grad_batches: Batches per optimiser step.
         callbacks: Callbacks; a `TrainingClock` and an `Interrupt` are added.
         plugins: Lightning's plugins; checkpoints are atomic unless a plugin writes them.
         **others: As for Lightning's Trainer.
@@ -67,6 +67,7 @@ class Trainer(lightning.Trainer):
         deterministic: bool | Literal["warn"] = False,
         tf32: bool = False,
         log_every_n_steps: Steps | None = None,
+        accumulate_grad_batches: Count = 1,
         callbacks: Sequence[Callback] = (),
         plugins: Any = None,
         **others: Any,
@@ -118,6 +119,7 @@ class Trainer(lightning.Trainer):
             deterministic=deterministic,
             max_steps=max_steps,
             log_every_n_steps=log_every_n_steps,
+            accumulate_grad_batches=accumulate_grad_batches,
             callbacks=[TrainingClock(max_seconds), *used, self.interrupt],
             plugins=own,
             **(usual | others),

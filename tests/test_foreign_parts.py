@@ -11,6 +11,7 @@ import pytest
 from lightning.pytorch import callbacks
 from lightning.pytorch.loggers import CSVLogger
 
+from tests.baselines.runs import TINEUVOX, baseline_config
 from tests.training.runs import checkpoint, metrics, small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError
@@ -18,6 +19,8 @@ from xplanes.files import read_rows
 from xplanes.run import run
 from xplanes.tools.evaluate import evaluate
 from xplanes.tools.runs import load_run
+from xplanes.training.csv_logger import CSVLogger as OwnCSVLogger
+from xplanes.training.evaluation import Evaluation
 from xplanes.training.fit import Trainer
 
 PLAIN = {"accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False}
@@ -44,6 +47,10 @@ def rows(folder: Path) -> list[dict[str, str]]:
         ({"precision": "bf16-true"}, r"precision=bf16-true.*model\.precision"),
         ({"precision": "16-mixed"}, r"precision=16-mixed.*model\.precision"),
         ({"overfit_batches": 1}, r"overfit_batches=1.*data\.views"),
+        *(
+            ({name: 5, "callbacks": [Evaluation()]}, rf"{name}=5: .*callbacks\.evaluation\.at")
+            for name in ("val_check_interval", "check_val_every_n_epoch", "num_sanity_val_steps")
+        ),
         (
             {"callbacks": [callbacks.StochasticWeightAveraging(0.1)]},
             r"StochasticWeightAveraging.*EMAWeightAveraging",
@@ -55,12 +62,36 @@ def test_what_would_train_wrongly_is_refused(options, words):
         Trainer(max_steps=2, **PLAIN, **options)
 
 
-def test_a_plain_trainer_that_scales_or_widens_numbers_is_refused(scenes):
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"precision": "64-true"}, r"precision=64-true.*model\.precision"),
+        ({"overfit_batches": 1}, r"overfit_batches=1.*data\.views"),
+    ],
+)
+def test_a_plain_trainer_that_would_train_wrongly_is_refused(options, words, scenes):
     config = small_config(scenes)
     module, data = RadianceModule(config), SceneDataModule(config["data"])
-    trainer = lightning.Trainer(max_steps=2, precision="64-true", logger=False, **PLAIN)
-    with pytest.raises(ConfigError, match=r"precision=64-true.*model\.precision"):
+    trainer = lightning.Trainer(max_steps=2, logger=False, **PLAIN, **options)
+    with pytest.raises(ConfigError, match=words):
         trainer.fit(module, data)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        ("model=tineuvox_reduced", *TINEUVOX),
+        ("model=gaussians_hexplane", "model.count=20", "model.resolution=8", "model.width=16"),
+    ],
+)
+def test_averages_of_weights_that_change_their_shapes_are_refused(model, scenes):
+    config = baseline_config(scenes, *model)
+    module, data = RadianceModule(config), SceneDataModule(config["data"])
+    average = callbacks.EMAWeightAveraging(use_buffers=False)
+    trainer = lightning.Trainer(max_steps=2, logger=False, callbacks=[average], **PLAIN)
+    with pytest.raises(ConfigError, match=r"callbacks: EMAWeightAveraging: .*Model .*leave it out"):
+        trainer.fit(module, data)
+    assert trainer.global_step == 0
 
 
 @pytest.mark.parametrize("precision", [None, 32, "32", "32-true"])
@@ -103,6 +134,20 @@ def test_a_resumed_run_goes_on_with_its_csv(scenes, tmp_path):
     assert steps("parts") == steps("whole") == [1, 3, 5, 7, 9, 11, 13]
     kept = rows(tmp_path / "parts")[: len(before)]
     assert [{k: row[k] for k in before[0]} for row in kept][:4] == before[:4]
+
+
+@pytest.mark.parametrize("rest", ["0.5,9", "0.5,,", "0.5,\0\0", "0.5,9,0.5,9"])
+def test_a_row_that_was_cut_off_does_not_end_the_csv(tmp_path, rest):
+    def log(step: int) -> None:
+        log = OwnCSVLogger(tmp_path, name="", version="csv")
+        log.log_metrics({"loss": 0.5, "train/loss": 0.5}, step)
+        log.save()
+
+    log(3)
+    with (tmp_path / "csv" / "metrics.csv").open("a") as file:
+        file.write(rest)
+    log(9)
+    assert [row["step"] for row in rows(tmp_path)] == ["3", "9"]
 
 
 def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(scenes, tmp_path, trained_run):

@@ -188,6 +188,8 @@ MISFITS = (
     ("trainer.max_secnds", 3, "Trainer has no such argument"),
     ("trainer.accelerator", "tpu", "must be one of auto, cpu, gpu"),
     ("trainer.max_seconds", -1, "must be above 0"),
+    ("trainer.max_steps", 1e3, "must be one of -1 or a whole number"),
+    ("trainer.accumulate_grad_batches", 0, "must be above 0"),
     ("logger.tensorboard.foo", 1, "TensorBoardLogger has no such argument"),
 )
 

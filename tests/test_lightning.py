@@ -213,12 +213,36 @@ def test_gradients_are_clipped_and_accumulated(config, tmp_path):
     """Regularisers count towards the norm, once for each update."""
     steps = Steps()
     options = {"gradient_clip_val": 1e-3, "accumulate_grad_batches": 2, "callbacks": [steps]}
-    used = trainer(tmp_path, logger=False, max_steps=4, limit_val_batches=0, **options)
+    # The third batch ends the epoch, and hence a step; each step is logged.
+    options |= {"limit_train_batches": 3, "log_every_n_steps": 1}
+    used = trainer(tmp_path, max_steps=4, limit_val_batches=0, **options)
     module = RadianceModule(config)
     used.fit(module, SceneDataModule(config["data"]))
-    assert (used.global_step, module.batches) == (4, 8)
+    assert (used.global_step, module.batches) == (4, 6)
+    assert len(logged(tmp_path)["train/loss"]) == 4
     assert max(steps.norms) < 1.001e-3
     assert module.tally.last["loss"] > 0
+
+
+class BreaksOff(lightning.Callback):
+    """Notes learning rates, and fails in the first step."""
+
+    def __init__(self) -> None:
+        self.rates: list[float] = []
+
+    def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
+        self.rates.append(optimizer.param_groups[0]["lr"])
+        if len(self.rates) == 1:
+            raise RuntimeError("a fault of one's own")
+
+
+def test_a_fit_after_one_that_was_broken_off_begins_with_low_rates(config, tmp_path):
+    module, data, steps = RadianceModule(config), SceneDataModule(config["data"]), BreaksOff()
+    options = {"logger": False, "limit_val_batches": 0, "callbacks": [steps]}
+    with pytest.raises(RuntimeError, match="a fault of one's own"):
+        trainer(tmp_path, **options).fit(module, data)
+    trainer(tmp_path, **options | {"max_steps": 2}).fit(module, data)
+    assert steps.rates[0] == steps.rates[1] < steps.rates[2]
 
 
 def test_two_halves_of_a_batch_make_the_same_step_as_the_whole(config):

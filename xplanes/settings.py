@@ -208,7 +208,7 @@ def _check(name: str, value: Any, hint: Any) -> None:
     if not any(_fits(value, kind) for kind in kinds if get_origin(kind) is not Literal):
         if choices:
             named = ", ".join(map(str, choices))
-            other = " or a number" if {int, float} & set(kinds) else ""
+            other = " or a number" if float in kinds else " or a whole number" * (int in kinds)
             raise ConfigError(f"{name}={value}: must be one of {named}{other}")
         raise ConfigError(f"{name}={value}: must be {_words(kinds)}")
     for allowed in ranges:

@@ -285,8 +285,24 @@ def test_a_damaged_checkpoint_gives_way_to_the_best(train, whole, folder, caplog
     same_state(checkpoint(whole)["state_dict"], checkpoint(folder)["state_dict"])
 
 
+def test_a_lost_checkpoint_gives_way_to_the_best_or_is_missed_aloud(folder, caplog):
+    last, best = (folder / "checkpoints" / f"{name}.ckpt" for name in ("last", "best"))
+    last.unlink()
+    with pytest.raises(ConfigError, match="holds a run already"):
+        claim(folder, resume=False)
+    assert find_resumable(last.parent) == last
+    assert last.read_bytes() == best.read_bytes()
+    assert "last.ckpt does not exist; try best.ckpt beside it. Continuing from" in caplog.text
+    for name in ("metrics.json", "curve.csv"):
+        shutil.rmtree(last.parent, ignore_errors=True)
+        caplog.clear()
+        assert find_resumable(last.parent) is None
+        assert "training starts again at step 0" in caplog.text
+        (folder / name).unlink()
+
+
 def test_damaged_checkpoints_alone_are_refused_with_a_message(tmp_path):
-    assert find_resumable(tmp_path) is None
+    assert find_resumable(tmp_path / "checkpoints") is None
     for name in ("last.ckpt", "best.ckpt"):
         (tmp_path / name).write_bytes(b"half")
         with pytest.raises(ConfigError, match=r"last\.ckpt cannot be read.*start again, delete"):

@@ -120,6 +120,11 @@ class Model(ABC):
         return {}
 
     @property
+    def replaces_parameters(self) -> bool:
+        """Whether training changes the parameters' shapes, so that weights cannot be averaged."""
+        return False
+
+    @property
     def sparse(self) -> Tensor | None:
         """The sparse part of the initial values, while a loss term needs it. [T, 3, C, H, H]
 

@@ -268,6 +268,19 @@ def require_whole_floats(precision: str) -> None:
         )
 
 
+def require_new_rays(overfit_batches: float) -> None:
+    """Refuse a Trainer that repeats batches: rays are drawn again at each step.
+
+    Raises:
+        ConfigError: With the setting to use instead.
+    """
+    if overfit_batches:
+        raise ConfigError(
+            f"overfit_batches={overfit_batches}: rays are drawn again at each step; leave it out, "
+            "and set data.views to train on few images"
+        )
+
+
 def require_groups(model: Model, sampler: Sampler) -> None:
     """Refuse parameter groups that training cannot work with.
 

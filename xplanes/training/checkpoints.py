@@ -16,7 +16,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from xplanes.errors import ConfigError
-from xplanes.files import replacing, stand_in
+from xplanes.files import read_rows, replacing, stand_in
 from xplanes.training.clock import TrainingClock, off_clock
 from xplanes.training.diagnosis import require_finite
 from xplanes.training.interrupt import Stopped
@@ -153,11 +153,11 @@ class Checkpoints(ModelCheckpoint):
 
 def has_checkpoint(run: Path) -> bool:
     """Whether a run directory contains a checkpoint to resume from."""
-    return (run / "checkpoints" / LAST).is_file()
+    return any((run / "checkpoints" / name).is_file() for name in (LAST, BEST))
 
 
 def find_resumable(folder: Path) -> Path | None:
-    """The checkpoint to resume from; if the last one is damaged, the best one replaces it.
+    """The checkpoint to resume from; if the last one is lost or damaged, the best replaces it.
 
     Returns:
         ``last.ckpt``; None if there is none, so that training starts from the beginning.
@@ -166,7 +166,11 @@ def find_resumable(folder: Path) -> Path | None:
         ConfigError: If neither can be read.
     """
     last, best = folder / LAST, folder / BEST
-    if not last.is_file():
+    if not (last.is_file() or best.is_file()):
+        run = folder.parent
+        rows = read_rows(run / "curve.csv")
+        if (run / "metrics.json").is_file() or any(row.get("step") != "0" for row in rows):
+            logger.warning("%s: its checkpoints are gone; training starts again at step 0", run)
         return None
     try:
         load_checkpoint(last)
@@ -174,7 +178,8 @@ def find_resumable(folder: Path) -> Path | None:
         try:
             step = load_checkpoint(best)["global_step"]
         except (ConfigError, KeyError, TypeError):
-            raise ConfigError(f"{problem}; to start again, delete {last}") from problem
+            found = " and ".join(str(path) for path in (last, best) if path.is_file())
+            raise ConfigError(f"{problem}; to start again, delete {found}") from problem
         logger.warning("%s. Continuing from %s, step %d", problem, best, step)
         with replacing(last) as temporary:
             shutil.copyfile(best, temporary)
@@ -194,6 +199,8 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
                 f"{path} does not exist: no validation scores have chosen a best step; take {LAST} "
                 "(--checkpoint last)"
             )
+        if path.name == LAST and beside.is_file():
+            raise ConfigError(f"{path} does not exist; try {BEST} beside it")
         raise ConfigError(
             f"{path} does not exist: the run stopped before its first checkpoint "
             "(callbacks.checkpoints.every)"

@@ -30,7 +30,10 @@ class CSVLogger(loggers.CSVLogger):
 class _Writer(ExperimentWriter):
     def __init__(self, log_dir: str) -> None:
         self._file = Path(log_dir) / self.NAME_METRICS_FILE
-        self._earlier: list[dict[str, Any]] = list(read_rows(self._file))
+        rows = read_rows(self._file)  # The last is cut off if the run was killed.
+        self._earlier: list[dict[str, Any]] = [
+            row for row in rows if None not in (*row, *row.values()) and row["step"].isdigit()
+        ]
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".* exists and is not empty")  # Rows are kept here.
             super().__init__(log_dir)

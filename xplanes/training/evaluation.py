@@ -104,7 +104,10 @@ class Evaluation(Callback):
         assert isinstance(pl_module, RadianceModule)
         assert self._passed is not None
         due = sum(share <= pl_module.progress for share in self.at) > self._passed
-        ends = pl_module.progress >= 1
+        # With min_steps training goes on after the budget is used up.
+        ends = trainer.should_stop and trainer.fit_loop._can_stop_early
+        ends |= trainer.global_step >= trainer.max_steps >= 0
+        ends &= pl_module.progress >= 1
         if (due or ends) and pl_module.between_updates:
             # Lightning validates after multiples of this number of batches, so it does so now.
             trainer.val_check_batch = trainer.fit_loop.epoch_loop.total_batch_idx + 1

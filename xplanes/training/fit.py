@@ -23,7 +23,7 @@ from xplanes.scenes.batches import Batch
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Scene
 from xplanes.settings import Count, Positive, Steps
-from xplanes.training.building import require_whole_floats
+from xplanes.training.building import require_new_rays, require_whole_floats
 from xplanes.training.checkpoints import AtomicCheckpointIO, Checkpoints, find_resumable
 from xplanes.training.clock import TrainingClock, find_callback
 from xplanes.training.collapse import CollapseWatch
@@ -32,6 +32,9 @@ from xplanes.training.interrupt import Interrupt
 from xplanes.training.losses import loss_terms
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore
+
+WHEN = ("val_check_interval", "check_val_every_n_epoch", "num_sanity_val_steps")
+"""Arguments of Lightning's Trainer that say when to validate."""
 
 
 class Trainer(lightning.Trainer):
@@ -45,6 +48,7 @@ class Trainer(lightning.Trainer):
         deterministic: Bit-identical runs; CPU only, with a budget in steps.
         tf32: On GPUs, multiply float32 matrices in TF32 (10-bit mantissa), which is faster.
         log_every_n_steps: Steps between log entries; 0 for none.
+        accumulate_grad_batches: Batches per optimiser step.
         callbacks: Callbacks; a `TrainingClock` and an `Interrupt` are added.
         plugins: Lightning's plugins; checkpoints are atomic unless a plugin writes them.
         **others: As for Lightning's Trainer.
@@ -63,23 +67,25 @@ class Trainer(lightning.Trainer):
         deterministic: bool | Literal["warn"] = False,
         tf32: bool = False,
         log_every_n_steps: Steps | None = None,
+        accumulate_grad_batches: Count = 1,
         callbacks: Sequence[Callback] = (),
         plugins: Any = None,
         **others: Any,
     ) -> None:
         if max_seconds is not None and not max_seconds > 0:
             raise ConfigError(f"max_seconds={max_seconds}: must be above 0, or null for no limit")
-        if others.get("overfit_batches", 0) != 0:
-            raise ConfigError(
-                f"overfit_batches={others['overfit_batches']}: rays are drawn again at each step; "
-                "leave it out, and set data.views to train on few images"
-            )
+        require_new_rays(others.get("overfit_batches", 0))
         require_whole_floats(str(others.get("precision") or "32-true"))
         for callback in callbacks:
             if isinstance(callback, StochasticWeightAveraging):
                 raise ConfigError(
                     f"callbacks: {type(callback).__name__}: the model's schedules would override "
                     "its learning rates; use lightning.pytorch.callbacks.EMAWeightAveraging"
+                )
+            if isinstance(callback, Evaluation) and (name := next(filter(others.get, WHEN), None)):
+                raise ConfigError(
+                    f"{name}={others[name]}: Evaluation chooses when to validate; set "
+                    "callbacks.evaluation.at, shares of the budget"
                 )
         device = find_device(accelerator)
         if device.type == "cuda":
@@ -113,6 +119,7 @@ class Trainer(lightning.Trainer):
             deterministic=deterministic,
             max_steps=max_steps,
             log_every_n_steps=log_every_n_steps,
+            accumulate_grad_batches=accumulate_grad_batches,
             callbacks=[TrainingClock(max_seconds), *used, self.interrupt],
             plugins=own,
             **(usual | others),

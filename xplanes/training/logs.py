@@ -16,10 +16,12 @@ if TYPE_CHECKING:
 
 def logs_now(trainer: Trainer) -> bool:
     """Whether the last batch is to be logged: it ends a step that Lightning logs."""
-    every = trainer.log_every_n_steps * trainer.accumulate_grad_batches  # type: ignore[attr-defined]
-    # The Trainer's own count: it begins at 0 even if the module was loaded.
-    batch = trainer.fit_loop.epoch_loop.total_batch_idx + 1
-    return bool(every and not batch % every and trainer.loggers)
+    every, loop = trainer.log_every_n_steps, trainer.fit_loop.epoch_loop  # type: ignore[attr-defined]
+    # Lightning's own count: it begins at 0 even if the module was loaded, and the last batches of
+    # an epoch may make a step of fewer batches.
+    step = loop._batches_that_stepped + 1
+    ends = not loop._should_accumulate()
+    return bool(every and not step % every and ends and trainer.loggers)
 
 
 def forget_later(trainer: Trainer, step: int) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor, nn
 
@@ -31,6 +32,7 @@ from xplanes.training.building import (
     build_parts,
     parts_from,
     require_frame,
+    require_new_rays,
     require_version,
     require_whole_floats,
     site_content,
@@ -151,6 +153,7 @@ class RadianceModule(ViewScoring):
 
     def setup(self, stage: str) -> None:
         require_whole_floats(str(self.trainer.precision))
+        require_new_rays(self.trainer.overfit_batches)  # type: ignore[attr-defined]
 
     def configure_model(self) -> None:
         # Loaded without a Trainer, the field is built in `on_load_checkpoint`.
@@ -288,6 +291,15 @@ class RadianceModule(ViewScoring):
         callbacks: list[Any] = trainer.callbacks  # type: ignore[attr-defined]
         self._schedules = [c for c in callbacks if isinstance(getattr(c, "progress", None), float)]
         self.method.require_devices(trainer.world_size)
+        for callback in callbacks if self.model.replaces_parameters else ():
+            if isinstance(callback, WeightAveraging):
+                raise ConfigError(
+                    f"callbacks: {type(callback).__name__}: {type(self.model).__name__} changes "
+                    "the shapes of its parameters in training, so that they have no mean; leave it "
+                    "out"
+                )
+        # An earlier fit may have been interrupted within a step.
+        self.between_updates, self._losses, self._seen = True, [], None
 
     def on_train_start(self) -> None:
         if self.global_rank:  # What a checkpoint holds counts once, in the first process.

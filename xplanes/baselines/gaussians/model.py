@@ -105,6 +105,10 @@ class GaussiansModel(Model):
     def field(self) -> Gaussians:
         return self._field
 
+    @property
+    def replaces_parameters(self) -> bool:
+        return self._settings.densify.until > 0
+
     def groups(self) -> list[Group]:
         settings, field = self._settings, self._field
         rates = {

@@ -127,6 +127,10 @@ class TiNeuVoxModel(Model):
     def field(self) -> TiNeuVox:
         return self._field
 
+    @property
+    def replaces_parameters(self) -> bool:
+        return bool(self.settings.grow_at)
+
     def groups(self) -> list[Group]:
         settings, field = self.settings, self._field
         groups: list[Group] = [

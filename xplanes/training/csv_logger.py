@@ -1,6 +1,5 @@
 """Lightning's CSVLogger for runs that are resumed."""
 
-import warnings
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,26 +27,17 @@ class CSVLogger(loggers.CSVLogger):
 
 
 class _Writer(ExperimentWriter):
-    def __init__(self, log_dir: str) -> None:
-        self._file = Path(log_dir) / self.NAME_METRICS_FILE
-        rows = read_rows(self._file)  # The last is cut off if the run was killed.
-        self._earlier: list[dict[str, Any]] = [
+    def _check_log_dir_exists(self) -> None:
+        """Read an earlier file, where Lightning's class would delete it."""
+        rows = read_rows(Path(self.metrics_file_path))  # The last is cut off if the run was killed.
+        self._earlier: list[Any] = [
             row for row in rows if None not in (*row, *row.values()) and row["step"].isdigit()
         ]
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".* exists and is not empty")  # Rows are kept here.
-            super().__init__(log_dir)
-        self._begin_with(self._earlier)
 
     def log_metrics(self, metrics_dict: dict[str, float], step: int | None = None) -> None:
         if step is not None and self._earlier:
-            kept = [row for row in self._earlier if int(row["step"]) < step]
-            if len(kept) < len(self._earlier):
-                self._file.unlink()
-                self._begin_with(kept)
+            Path(self.metrics_file_path).unlink()
+            self.metrics = [row for row in self._earlier if int(row["step"]) < step]
             self._earlier = []
+            self.save()
         super().log_metrics(metrics_dict, step)
-
-    def _begin_with(self, rows: list[dict[str, Any]]) -> None:
-        self.metrics = list(rows)
-        self.save()

@@ -21,7 +21,7 @@ from runner import CPU_CLOCK, RESULTS, Measured, machine, run_apart
 from xplanes import __version__
 from xplanes.config import compose_plain
 from xplanes.files import read_json, write_text
-from xplanes.lrm.bundled import FOLDER as SHIPPED
+from xplanes.lrm.weights import FOLDER as SHIPPED
 from xplanes.synthetic.demo.write import SUITE_VERSION, VERSION
 
 Row = dict[str, Any]

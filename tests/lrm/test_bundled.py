@@ -12,7 +12,7 @@ from tests.lrm.reduced import reduced
 from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.lrm import LRMError
-from xplanes.lrm.bundled import CHECKSUM, bundled_models, load_bundled
+from xplanes.lrm.weights import CHECKSUM, bundled_models, load_bundled
 from xplanes.preparation.sources import BundledLRMSettings
 
 

@@ -9,7 +9,7 @@ import torch
 from tests.balls import ball_scene
 from tests.training.runs import changed, composed, metrics
 from xplanes.files import read_rows
-from xplanes.lrm.bundled import bundled_models
+from xplanes.lrm.weights import bundled_models
 from xplanes.models.initialisation import Initialisation, Method, Place
 from xplanes.preparation.sources import LRMInitialiser
 from xplanes.scenes.frame import scene_frame

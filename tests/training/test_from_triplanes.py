@@ -263,7 +263,7 @@ def test_a_run_is_loaded_without_its_source(train, tmp_path):
     assert loaded.frame.scale == 0.55
     assert loaded.module.model is not None
     assert loaded.module.model.settings.channels == 4
-    assert loaded.module.field.decoder.density_activation == "exp"
+    assert loaded.module.field.decoder.density == "exp"
     scores = evaluate(loaded, network="none")
     assert scores["test"]["psnr"] == pytest.approx(metrics(folder)["test"]["psnr"], abs=1e-6)
     with pytest.raises(ConfigError, match="there is no such file"):

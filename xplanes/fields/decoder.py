@@ -11,6 +11,9 @@ Activation = Literal["relu", "silu"]
 DensityActivation = Literal["softplus", "exp"]
 Precision = Literal["32", "bf16"]
 
+DECODER_OPTIONS = ("width", "hidden", "activation", "density", "density_scale", "colour_margin")
+"""Options of a decoder that its weights require, as in the group ``model.decoder``."""
+
 MOST_EXPONENT = 60.0
 """Larger logits are clamped to this: the gradients of an infinite density would be NaN."""
 
@@ -79,24 +82,15 @@ class Decoder(nn.Module):
         sizes = [3 * channels, *[width] * hidden, 4]
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
         self.width, self.hidden = width, hidden
-        self.activation_name: Activation = activation
-        self.activation = _ACTIVATIONS[activation]
-        self.density_activation: DensityActivation = density
-        self.density_scale = density_scale
+        self.activation: Activation = activation
+        self.density: DensityActivation = density
+        self.density_scale, self.colour_margin = density_scale, colour_margin
         self.precision: Precision = precision
-        self.colour_margin = colour_margin
 
     @property
     def options(self) -> dict[str, Any]:
-        """Constructor arguments that its weights require: all except channels and precision."""
-        return {
-            "width": self.width,
-            "hidden": self.hidden,
-            "activation": self.activation_name,
-            "density": self.density_activation,
-            "density_scale": self.density_scale,
-            "colour_margin": self.colour_margin,
-        }
+        """Constructor arguments that its weights require, by the names of `DECODER_OPTIONS`."""
+        return {name: getattr(self, name) for name in DECODER_OPTIONS}
 
     def logits(self, features: Tensor) -> Tensor:
         """The last layer's output before the activations. [N, 3 C] -> [N, 4]"""
@@ -104,14 +98,14 @@ class Decoder(nn.Module):
         with torch.autocast(features.device.type, torch.bfloat16, enabled=bf16):
             hidden = half_rows(features) if bf16 else features
             for layer in self.layers[:-1]:
-                hidden = self.activation(layer(hidden))
+                hidden = _ACTIVATIONS[self.activation](layer(hidden))
             return self.layers[-1](hidden)[: len(features)]
 
     def activate(self, logits: Tensor) -> tuple[Tensor, Tensor]:
         """Colour and density from logits, at least in float32. [N, 4] -> [N, 3], [N]"""
         if logits.dtype in (torch.float16, torch.bfloat16):
             logits = logits.float()
-        density = _DENSITIES[self.density_activation](logits[:, 0] - 1)
+        density = _DENSITIES[self.density](logits[:, 0] - 1)
         colour = logits[:, 1:].sigmoid()
         if self.colour_margin:
             colour = colour * (1 + 2 * self.colour_margin) - self.colour_margin

@@ -1,12 +1,13 @@
 """Sizes of a Large Reconstruction Model, read from the configuration published with it."""
 
+import math
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 from xplanes.errors import LRMError
 from xplanes.lrm.canonical import OPENLRM_VIEW
-from xplanes.lrm.reader import Reader
 
 
 class Published(NamedTuple):
@@ -179,6 +180,82 @@ class LRMConfig:
         return 2 * self.low_resolution
 
 
+@dataclass(frozen=True)
+class Reader:
+    """Reads settings from a nested configuration; errors name missing or invalid keys.
+
+    Attributes:
+        values: The section read from.
+        place: Key path of the section, for messages.
+        root: The whole configuration, for resolving references; ``values`` if empty.
+    """
+
+    values: Mapping[str, Any]
+    place: str = ""
+    root: Mapping[str, Any] = field(default_factory=dict)
+
+    def inner(self, key: str) -> "Reader":
+        """A subsection."""
+        value = self.values.get(key)
+        if not isinstance(value, Mapping):
+            raise LRMError(f"the model's configuration has no section {self.place}{key}")
+        return Reader(value, f"{self.place}{key}.", self.root or self.values)
+
+    def integer(self, key: str, default: int | None = None) -> int:
+        """A positive integer."""
+        value = self._value(key, default)
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise self._error(key, value, "must be a whole number above zero")
+        return value
+
+    def number(self, key: str, default: float) -> float:
+        """A number."""
+        value = self._value(key, default)
+        try:
+            return float(value)  # YAML 1.1 reads 1e-12 as text
+        except (TypeError, ValueError):
+            raise self._error(key, value, "must be a number") from None
+
+    def positive(self, key: str, default: float) -> float:
+        """A finite positive number."""
+        value = self.number(key, default)
+        if not 0 < value < math.inf:
+            raise self._error(key, value, "must be above zero")
+        return value
+
+    def require(self, key: str, value: Any) -> None:
+        """Refuse any value other than the supported one."""
+        if (found := self._value(key, value)) != value:
+            raise self._error(key, found, f"only {value!r} is supported")
+
+    def triple(self, key: str, default: tuple[float, ...]) -> tuple[float, ...]:
+        """Three numbers."""
+        values = self.values.get(key, default)
+        if not isinstance(values, list | tuple) or len(values) != 3:
+            raise self._error(key, values, "must be three numbers")
+        return tuple(float(value) for value in values)
+
+    def _error(self, key: str, value: Any, wanted: str) -> LRMError:
+        return LRMError(f"the model's configuration has {self.place}{key}={value!r}: {wanted}")
+
+    def _value(self, key: str, default: Any) -> Any:
+        """A value, with references ``${a.b}``, as in TripoSR's YAML, resolved."""
+        value = self.values.get(key, default)
+        for _ in range(8):
+            match = re.fullmatch(r"\$\{([\w.]+)\}", value) if isinstance(value, str) else None
+            if match is None:
+                return value
+            found: Any = self.root or self.values
+            for name in match[1].split("."):
+                if not isinstance(found, Mapping) or name not in found:
+                    raise LRMError(
+                        f"the model's configuration refers to {value}, which does not exist"
+                    )
+                found = found[name]
+            value = found
+        raise LRMError(f"the model's configuration refers to {value} in a circle")
+
+
 def parse_config(config: Mapping[str, Any]) -> LRMConfig:
     """Sizes from a checkpoint's own configuration.
 
@@ -241,7 +318,7 @@ def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig
     model = Reader(config).inner("model") if nested else Reader(config)
     # Keys that published files lack may be written beside the section of the model, or in it.
     given = Reader({**config, **model.values})
-    reduced = _encoder_sizes(given.values)
+    sizes = _encoder_sizes(given)
     width, low = model.integer("transformer_dim"), model.integer("triplane_low_res")
     if model.integer("triplane_high_res", 2 * low) != 2 * low:
         raise LRMError(
@@ -251,10 +328,10 @@ def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig
     name = model.values.get("encoder_model_name")
     if architecture == "openlrm-1.1":
         model.require("encoder_type", "dinov2")
-        encoder = _dinov2(name, reduced)
-        fallback = encoder.grid * encoder.patch if reduced else SOURCE_SIZES.get(width, 224)
+        encoder = _dinov2(name, sizes)
+        fallback = encoder.grid * encoder.patch if sizes.values else SOURCE_SIZES.get(width, 224)
     else:
-        encoder = _dino(name, reduced, given.values)
+        encoder = _dino(name, sizes, given)
         fallback = 224
     model.require("encoder_feat_dim", encoder.width)
     infer = config.get("infer")
@@ -280,9 +357,10 @@ def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig
     )
 
 
-def _encoder_sizes(config: Mapping[str, Any]) -> Any:
+def _encoder_sizes(given: Reader) -> Reader:
     """Sizes of a non-standard encoder, under either key."""
-    return config.get("encoder_sizes") or config.get("_reduced_encoder")
+    sizes = given.values.get("encoder_sizes") or given.values.get("_reduced_encoder")
+    return Reader(sizes or {}, "encoder_sizes.")
 
 
 def _triposr(config: Reader) -> LRMConfig:
@@ -299,7 +377,7 @@ def _triposr(config: Reader) -> LRMConfig:
     ):
         reader.require(key, value)
     name = config.inner("image_tokenizer").values.get("pretrained_model_name_or_path")
-    encoder = _dino(name, _encoder_sizes(config.values), config.values)
+    encoder = _dino(name, _encoder_sizes(config), config)
     width, channels = tokenizer.integer("num_channels"), upsampler.integer("out_channels")
     backbone.require("in_channels", width)
     backbone.require("cross_attention_dim", encoder.width)
@@ -320,12 +398,10 @@ def _triposr(config: Reader) -> LRMConfig:
     )
 
 
-def _dino(name: Any, reduced: Any, config: Mapping[str, Any]) -> EncoderConfig:
+def _dino(name: Any, sizes: Reader, given: Reader) -> EncoderConfig:
     if name != "facebook/dino-vitb16":
         raise LRMError(f"the image encoder {name!r} is not supported: only facebook/dino-vitb16")
-    sizes = Reader(reduced or {}, "encoder_sizes.")
     patch = sizes.integer("patch_size", 16)
-    given = Reader(config)
     mean = given.triple("image_mean", sizes.triple("image_mean", IMAGENET_MEAN))
     std = given.triple("image_std", sizes.triple("image_std", IMAGENET_STD))
     return EncoderConfig(
@@ -341,13 +417,12 @@ def _dino(name: Any, reduced: Any, config: Mapping[str, Any]) -> EncoderConfig:
     )
 
 
-def _dinov2(name: Any, reduced: Any) -> EncoderConfig:
+def _dinov2(name: Any, sizes: Reader) -> EncoderConfig:
     if name not in DINOV2:
         raise LRMError(
             f"the image encoder {name!r} is not supported: must be one of {', '.join(DINOV2)}"
         )
     width, heads = DINOV2[name]
-    sizes = Reader(reduced or {}, "encoder_sizes.")
     width, patch = sizes.integer("embed_dim", width), sizes.integer("patch_size", 14)
     sizes.require("interpolate_antialias", True)
     sizes.require("interpolate_offset", 0.0)

@@ -66,14 +66,7 @@ class OpenLRM(LRM):
 
     def __init__(self, config: LRMConfig) -> None:
         view = replace(OPENLRM_VIEW, distance=config.source_distance, focal=config.source_focal)
-        super().__init__(
-            config,
-            view,
-            activation="relu",
-            density="softplus",
-            density_scale=config.density_scale,
-            colour_margin=0.001,
-        )
+        super().__init__(config, view, density_scale=config.density_scale)
         self.camera = nn.Sequential(
             nn.Linear(16, config.camera_width),
             nn.SiLU(),

@@ -18,15 +18,11 @@ from xplanes.settings import Count, Location, Positive, Range, Settings
 
 STAGES = ("fixed_view", "lrm", "decomposition", "convert", "fill")
 
+NO_TIME: dict[str, float] = dict.fromkeys(STAGES, 0.0)
+"""Seconds of each stage, all 0."""
 
-def no_time() -> dict[str, float]:
-    """Seconds of each stage, all 0."""
-    return dict.fromkeys(STAGES, 0.0)
-
-
-def nothing_skipped() -> dict[str, float]:
-    """Shares of the work that was left out, all 0."""
-    return {"frames": 0.0, "directions": 0.0}
+NOTHING_SKIPPED = {"frames": 0.0, "directions": 0.0}
+"""Shares of the work that was left out, all 0."""
 
 
 @dataclass(frozen=True)
@@ -55,11 +51,11 @@ class Initialisation:
     frame: Frame
     values: InitialValues | None = None
     report: dict[str, Any] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=no_time)
+    seconds: dict[str, float] = field(default_factory=NO_TIME.copy)
     description: str = "random initialisation"
     pictures: dict[str, Tensor] = field(default_factory=dict)
     lrm: dict[str, Any] = field(default_factory=dict)
-    skipped: dict[str, float] = field(default_factory=nothing_skipped)
+    skipped: dict[str, float] = field(default_factory=NOTHING_SKIPPED.copy)
 
 
 @dataclass(frozen=True)

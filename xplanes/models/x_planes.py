@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from xplanes.decomposition.sparse_loss import SparseProduct
-from xplanes.fields.decoder import Activation, Decoder, DensityActivation
+from xplanes.fields.decoder import DECODER_OPTIONS, Activation, Decoder, DensityActivation
 from xplanes.fields.regularisers import (
     add_distance_gradient,
     add_time_smoothness_gradient,
@@ -228,13 +228,8 @@ class XPlanesSettings(ModelSettings):
         with initial_values(site.seed, Stream.INITIAL_FIELD):
             decoder = Decoder(
                 self.channels,
-                width=options.width,
-                hidden=options.hidden,
-                activation=options.activation,
-                density=options.density,
-                density_scale=options.density_scale,
                 precision="bf16" if site.precision == "bf16" else "32",
-                colour_margin=options.colour_margin,
+                **{name: getattr(options, name) for name in DECODER_OPTIONS},
             )
         if initial is not None and initial.decoder is not None:
             decoder.load_state_dict(dict(initial.decoder))

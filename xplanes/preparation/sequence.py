@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from xplanes.errors import ConfigError
-from xplanes.fields import Decoder
+from xplanes.fields.decoder import DECODER_OPTIONS, Decoder
 from xplanes.files import replacing, stand_in
 from xplanes.scenes.frame import Frame, check_frame, frame_content, read_frame
 from xplanes.settings import check_arguments
@@ -69,9 +69,6 @@ def _split(content: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
             rest[name] = value
     return tensors, rest
 
-
-DECODER_OPTIONS = ("width", "hidden", "activation", "density", "density_scale", "colour_margin")
-"""Options of a decoder that its weights require, as in the group ``model.decoder``."""
 
 _KEYS = {"triplanes", "decoder", "decoder_config", "frame"}
 

@@ -8,17 +8,16 @@ from pathlib import Path
 from typing import Any, cast
 
 from xplanes.errors import ConfigError, LRMError
-from xplanes.lrm.bundled import load_bundled
-from xplanes.lrm.weights import WeightSource, find_weights, load_weights
+from xplanes.lrm.weights import WeightSource, find_weights, load_bundled, load_weights
 from xplanes.models.base import InitialValues
 from xplanes.models.initialisation import (
+    NO_TIME,
+    NOTHING_SKIPPED,
     Initialisation,
     Initialiser,
     InitialiserSettings,
     Method,
     Place,
-    no_time,
-    nothing_skipped,
 )
 from xplanes.models.x_planes import XPlanesSettings
 from xplanes.preparation.cache import Stage, StageCache
@@ -235,10 +234,10 @@ def from_sequence(
         frame=sequence.frame or place.frame,
         values=InitialValues(named_planes(planes, model.plane_set), sequence.decoder, target),
         report=report | ({"unexplained": unexplained} if unexplained else {}),
-        seconds=no_time() | dict(seconds) | spent,
+        seconds=NO_TIME | dict(seconds) | spent,
         description=_described(sequence, method, parts, unexplained, source),
         pictures={} if sparse is None else {"decomposition": parts_sheet(low_rank, sparse)},
-        skipped=nothing_skipped() | {"directions": left_out},
+        skipped=NOTHING_SKIPPED | {"directions": left_out},
     )
 
 

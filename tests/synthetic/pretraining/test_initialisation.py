@@ -9,9 +9,9 @@ from tests.refusals import assert_refused
 from tests.synthetic.pretraining.small import same, small_config, small_plain, small_sizes
 from xplanes.errors import ConfigError
 from xplanes.lrm import LRMError, load
-from xplanes.lrm.bundled import bundled_models, load_bundled
 from xplanes.lrm.canonical import canonical_vector
 from xplanes.lrm.config import parse_config
+from xplanes.lrm.weights import bundled_models, load_bundled
 from xplanes.synthetic.pretraining.initialisation import grow_model, init_model
 from xplanes.synthetic.pretraining.pool import FOCAL
 from xplanes.synthetic.pretraining.run import export, published_state

@@ -7,8 +7,8 @@ import torch
 
 from xplanes.config import CONF
 from xplanes.lrm.alignment import align
-from xplanes.lrm.bundled import FOLDER, bundled_models, load_bundled
 from xplanes.lrm.config import parse_config
+from xplanes.lrm.weights import FOLDER, bundled_models, load_bundled
 from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE, camera_at
 from xplanes.synthetic.pretraining import score as score_module
 from xplanes.synthetic.pretraining.pool import FOCAL

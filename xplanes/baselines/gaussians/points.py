@@ -13,12 +13,12 @@ from xplanes.config import CONF, compose_plain
 from xplanes.errors import ConfigError
 from xplanes.fields.xplanes import XPlanes
 from xplanes.models.initialisation import (
+    NO_TIME,
     Initialisation,
     Initialiser,
     InitialiserSettings,
     Method,
     Place,
-    no_time,
 )
 from xplanes.preparation.fixed_view import intrinsics_key, trained_field
 from xplanes.preparation.sources import cache_of
@@ -139,7 +139,7 @@ class FieldInitialiser(Initialiser):
             model=method.model,
             frame=place.frame,
             values=InitialPoints(cloud=cloud),
-            seconds=no_time() | {"field": stage.seconds},
+            seconds=NO_TIME | {"field": stage.seconds},
             description=f"{len(cloud.points):,} points on the surfaces of {settings.model}, "
             f"trained for {self._budget}",
         )

@@ -43,7 +43,7 @@ def _add_score(commands: "argparse._SubParsersAction") -> None:
 
 def _score(options: argparse.Namespace) -> None:
     from xplanes.errors import ConfigError
-    from xplanes.lrm.bundled import FOLDER, load_bundled
+    from xplanes.lrm.weights import FOLDER, load_bundled
     from xplanes.synthetic.pretraining.score import score_all
 
     if options.objects < 1:

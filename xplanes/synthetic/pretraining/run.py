@@ -21,10 +21,10 @@ from xplanes.errors import ConfigError
 from xplanes.files import read_json, replacing, write_json
 from xplanes.locks import alone_in
 from xplanes.lrm import load
-from xplanes.lrm.bundled import CHECKSUM
 from xplanes.lrm.config import LRMConfig, parse_config
 from xplanes.lrm.keys import NAMES
 from xplanes.lrm.openlrm import OpenLRM
+from xplanes.lrm.weights import CHECKSUM
 from xplanes.synthetic.pretraining.initialisation import grow_model, init_model
 from xplanes.synthetic.pretraining.module import PretrainingModule, Upkeep
 from xplanes.synthetic.pretraining.objects import HELD_OUT_SEEDS, TRAINING_SEEDS

@@ -138,6 +138,40 @@ def test_auto_finds_runs_whatever_was_said_to_hydra(tmp_path, monkeypatch):
     assert prepare([own[0], own[2], "resume=auto"])[-1] == "resume=null"
 
 
+def test_folders_of_groups_are_kept_and_found_again(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own groups").mkdir()
+    place = f"hydra.searchpath=['file://{tmp_path}/own groups']"
+    for given in (["--config-dir", "own groups"], ["-cd=own groups"], [place]):
+        assert prepare([*given, "seed=1"]) == [place, "seed=1"]
+    both = prepare(["--config-dir=own groups", "hydra.searchpath=[pkg://mine]"])
+    assert both == [place.replace("]", ",pkg://mine]")]
+    with pytest.raises(ConfigError, match="--config-dir nowhere: there is no such folder"):
+        prepare(["--config-dir", "nowhere"])
+    run = tmp_path / "outputs" / "run"
+    run.mkdir(parents=True)
+    (run / "run.json").write_text('{"status": "interrupted"}')
+    (run / "overrides.txt").write_text(f"{place}\nseed=1\n")
+    found = prepare(["--run", "--config-dir", "own groups", "seed=1", "resume=auto"])
+    assert found[-2:] == [f"resume={Path('outputs/run')}", "--run"]
+    assert found.count(place) == 1
+
+
+def test_options_may_stand_between_settings(tmp_path):
+    settings = ["lrm=none", "seed=0,1"]
+    for given in (["lrm=none", "-m", "seed=0,1"], [*settings, "-m"]):
+        assert prepare(given) == [*settings, "-m"]
+    mixed = ["seed=1", "--cfg", "job", "lrm=none", "--package=model"]
+    assert prepare(mixed) == ["seed=1", "lrm=none", "--cfg", "job", "--package=model"]
+
+
+def test_a_group_that_a_run_left_out_can_be_set_again(tmp_path):
+    (tmp_path / "overrides.txt").write_text("~logger\n~callbacks.viewer\nseed=1\n")
+    for new in (["logger=csv", "callbacks.viewer.port=1"], ["~callbacks.viewer", "~logger"]):
+        assert prepare([f"resume={tmp_path}", *new])[:3] == ["seed=1", *new]
+    assert prepare([f"resume={tmp_path}"])[:3] == ["~logger", "~callbacks.viewer", "seed=1"]
+
+
 def test_a_resumed_run_may_change_options_that_it_added(tmp_path):
     added = ("+losses.a._target_=tests.plugins.Dark", "+losses.a.weight=0.1", "++seed=3")
     (tmp_path / "overrides.txt").write_text("\n".join(added) + "\n")

@@ -214,7 +214,7 @@ def prepare(arguments: list[str]) -> list[str]:
         ConfigError: If Hydra cannot read the arguments, or the run cannot be resumed.
         StorageError: If the folder of the run cannot be written.
     """
-    require_readable(arguments)
+    arguments = _with_searchpath(require_readable(arguments))
     mode = dict(map(key_and_value, arguments)).get("hydra.mode")
     several = mode == "MULTIRUN" or not {"-m", "--multirun"}.isdisjoint(arguments)
     _require_present_names(arguments, several=several)
@@ -251,6 +251,27 @@ def prepare(arguments: list[str]) -> list[str]:
     return _resumed(Path(resume), arguments)
 
 
+def _with_searchpath(arguments: list[str]) -> list[str]:
+    """Write ``--config-dir`` as ``hydra.searchpath``, which is kept for a resumed run."""
+    folder, kept, words = "", [], iter(arguments)
+    for word in words:
+        option, _, value = word.partition("=")
+        if option in ("--config-dir", "-cd"):
+            folder = value or next(words)
+        else:
+            kept.append(word)
+    if not folder:
+        return arguments
+    if not Path(folder).is_dir():
+        raise ConfigError(f"--config-dir {folder}: there is no such folder")
+    place = quoted(f"file://{Path(folder).absolute()}")
+    given = next((word for word in kept if key_and_value(word)[0] == SEARCHPATH), None)
+    if given is None:
+        return [f"{SEARCHPATH}=[{place}]", *kept]
+    kept[kept.index(given)] = given.replace("[", f"[{place},", 1)
+    return kept
+
+
 def _resumed(run: Path, arguments: list[str]) -> list[str]:
     """A run's overrides, the new ones that replace or extend them, and its folder."""
     path = run / "overrides.txt"
@@ -269,7 +290,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
             "one key=value a line"
         )
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
-    changed = {key for key, _ in map(key_and_value, new) if key}
+    changed = {_key(text) for text in new}
     # Options that the run added with a plus sign are not in the configuration without it.
     added = {
         key_and_value(line)[0]: "++" if line.startswith("++") else "+"
@@ -277,7 +298,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
         if line.startswith("+")
     }
     new = [a if a[:1] in "+~" else added.get(key_and_value(a)[0], "") + a for a in new]
-    old = [line for line in text.splitlines() if line and key_and_value(line)[0] not in changed]
+    old = [line for line in text.splitlines() if line and not _gives_way(line, changed)]
     try:
         _require_present_names(old, several=False)
     except ConfigError as error:
@@ -285,7 +306,21 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
             f"resume={run}: it began with settings of an earlier version. {error}"
         ) from None
     place = quoted(str(run))
-    return [*old, *new, f"hydra.run.dir={place}", f"resume={place}"]
+    options = [a for a in new if not a.startswith("~") and not key_and_value(a)[0]]
+    new = [a for a in new if a not in options]
+    return [*old, *new, f"hydra.run.dir={place}", f"resume={place}", *options]
+
+
+def _key(override: str) -> str:
+    """Key of an override, also of one that deletes (``~key``)."""
+    return override.lstrip("+~").partition("=")[0]
+
+
+def _gives_way(line: str, changed: set[str]) -> bool:
+    """Whether a run's override is left out, because a new one sets its key or needs its group."""
+    key = _key(line)
+    below = line.startswith("~") and any(each.startswith(f"{key}.") for each in changed)
+    return below or key in changed
 
 
 def _require_present_names(arguments: Sequence[str], *, several: bool) -> None:
@@ -335,8 +370,8 @@ def _latest(overrides: list[str]) -> Path | None:
 
 
 def _without_resume(overrides: Iterable[str]) -> list[str]:
-    """Overrides without those that only say which run to resume."""
-    keys = {text: key_and_value(text)[0] for text in overrides if text}
+    """Overrides without those that only say which run to resume, and without options."""
+    keys = {text: key_and_value(text)[0] for text in overrides if text and text[0] != "-"}
     left_out = {"resume", *(key for key in keys.values() if key.startswith("hydra."))}
     return sorted(t for t, key in keys.items() if key == SEARCHPATH or key not in left_out)
 

@@ -237,6 +237,20 @@ def test_a_run_goes_on_from_another_directory(scenes, tmp_path):
     assert not list((tmp_path / "b").iterdir())
 
 
+def test_a_job_in_its_own_folder_finds_the_scene_of_the_command(scenes, tmp_path):
+    (tmp_path / "scenes").symlink_to(scenes)
+    run = tmp_path / "run"
+    given = (*SHORT, "data.root=scenes", "trainer.max_steps=2", "callbacks.evaluation=null")
+    place = ("hydra.job.chdir=true", f"hydra.run.dir={run}")
+    said = inside.train(*given, *place, cwd=tmp_path).stdout
+    assert not (run / "scenes").exists()
+    assert "metrics.json  checkpoints/last.ckpt" in said
+    record = (run / ".hydra" / "overrides.yaml").read_bytes()
+    refused = inside.train(*given, *place, "seed=1", cwd=tmp_path, code=1)
+    assert "holds a run already (finished)" in refused.stderr
+    assert (run / ".hydra" / "overrides.yaml").read_bytes() == record
+
+
 def test_a_stopped_sweep_says_how_the_whole_of_it_goes_on(tmp_path, monkeypatch, capsys):
     chosen = ["hydra.mode=MULTIRUN", f"hydra.sweep.dir={tmp_path}", "hydra.job.num=0"]
     config = with_hydra(*chosen, f"hydra.runtime.output_dir={tmp_path}", "hydra.job.id=0")

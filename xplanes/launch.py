@@ -3,6 +3,7 @@
 For a fast start, neither torch nor lightning is imported before the job begins.
 """
 
+import os
 import shlex
 import sys
 from collections.abc import Iterable, Sequence
@@ -14,6 +15,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
+from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
 
 import hydra_plugins.xplanes  # noqa: F401  # Launchers' processes need its resolvers.
@@ -107,6 +109,7 @@ class SettingsCheck(Callback):
         try:
             if (plain := _resolved(OmegaConf.masked_copy(config, names))) is None:
                 return
+            _find_root(plain)
             from xplanes.experiment import Experiment
 
             experiment = Experiment.read(plain)
@@ -116,11 +119,15 @@ class SettingsCheck(Callback):
             sys.exit(f"error: {error}")
         # Imported now, because it takes long: wrong settings have been refused.
         from xplanes.run import KNOWN_ERRORS, prepare
+        from xplanes.training.record import claim
 
         try:
             # Fails here if a setting that names the run directory is missing.
             folder = config.hydra.run.dir
             _prepared[folder] = prepare(experiment, Path(folder).absolute())
+            # Hydra would write over the record of a run that is there.
+            if config.resume is None and "LOCAL_RANK" not in os.environ:
+                claim(Path(folder), resume=False)
         except KNOWN_ERRORS as error:
             sys.exit(f"error: {error}")
 
@@ -144,6 +151,13 @@ def _resolved(config: DictConfig) -> dict[str, Any] | None:
         raise
 
 
+def _find_root(plain: dict[str, Any]) -> None:
+    """Make a relative data.root absolute if the job runs in its own folder (hydra.job.chdir)."""
+    data = plain.get("data")
+    if HydraConfig.get().job.chdir and isinstance(data, dict) and isinstance(data["root"], str):
+        data["root"] = to_absolute_path(data["root"])
+
+
 def _job(config: DictConfig) -> float:
     """Run one job and return its score, which optimising sweepers use."""
     from xplanes.run import KNOWN_ERRORS, run
@@ -153,6 +167,7 @@ def _job(config: DictConfig) -> float:
     folder = Path(settings.runtime.output_dir)
     try:
         plain = to_plain(config)
+        _find_root(plain)
         if sweep and plain["trainer"].get("devices") not in (1, "1"):
             raise ConfigError(
                 "trainer.devices > 1 in a multirun: helper processes would start the whole sweep "
@@ -222,6 +237,10 @@ def prepare(arguments: list[str]) -> list[str]:
     require_parsed([text for text in arguments if key_and_value(text)[0]])
     # Lightning passes names in quotes to the other processes of a run.
     values = {key: unquoted(value) for key, value in map(key_and_value, arguments) if key}
+    for text in arguments:
+        key = key_and_value(text)[0]
+        if key.isalpha() and text.startswith("+") and (CONF / key).is_dir():
+            raise ConfigError(f"{text}: the group is there already; write {text.lstrip('+')}")
     for key, value in values.items():
         if value in ("null", "None") and (CONF / key).is_dir():
             known = ", ".join(sorted(path.stem for path in (CONF / key).glob("*.yaml")))

@@ -154,7 +154,7 @@ def _resolved(config: DictConfig) -> dict[str, Any] | None:
 def _find_root(plain: dict[str, Any]) -> None:
     """Make a relative data.root absolute if the job runs in its own folder (hydra.job.chdir)."""
     data = plain.get("data")
-    if HydraConfig.get().job.chdir and isinstance(data, dict) and isinstance(data["root"], str):
+    if HydraConfig.get().job.chdir and isinstance(data, dict) and isinstance(data.get("root"), str):
         data["root"] = to_absolute_path(data["root"])
 
 
@@ -238,8 +238,7 @@ def prepare(arguments: list[str]) -> list[str]:
     # Lightning passes names in quotes to the other processes of a run.
     values = {key: unquoted(value) for key, value in map(key_and_value, arguments) if key}
     for text in arguments:
-        key = key_and_value(text)[0]
-        if key.isalpha() and text.startswith("+") and (CONF / key).is_dir():
+        if (key := key_and_value(text)[0]).isalpha() and text[0] == "+" and (CONF / key).is_dir():
             raise ConfigError(f"{text}: the group is there already; write {text.lstrip('+')}")
     for key, value in values.items():
         if value in ("null", "None") and (CONF / key).is_dir():
@@ -338,8 +337,7 @@ def _key(override: str) -> str:
 def _gives_way(line: str, changed: set[str]) -> bool:
     """Whether a run's override is left out, because a new one sets its key or needs its group."""
     key = _key(line)
-    below = line.startswith("~") and any(each.startswith(f"{key}.") for each in changed)
-    return below or key in changed
+    return key in changed or (line[0] == "~" and any(e.startswith(f"{key}.") for e in changed))
 
 
 def _require_present_names(arguments: Sequence[str], *, several: bool) -> None:

@@ -118,8 +118,7 @@ class SettingsCheck(Callback):
         except XPlanesError as error:
             sys.exit(f"error: {error}")
         # Imported now, because it takes long: wrong settings have been refused.
-        from xplanes.run import KNOWN_ERRORS, prepare
-        from xplanes.training.record import claim
+        from xplanes.run import KNOWN_ERRORS, claim, prepare
 
         try:
             # Fails here if a setting that names the run directory is missing.

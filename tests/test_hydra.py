@@ -108,6 +108,7 @@ ANSWERS = (
     ("train lrm=tripo", "Did you mean lrm=triposr?"),
     ("train lrm=TripoSR", "Did you mean lrm=large (TripoSR)?"),
     ("train lrm=openlrm", "Did you mean lrm=openlrm_base?"),
+    ("train +experiment=demo", "write experiment=demo"),
     ("train experiment=tabel1", "Did you mean -m sweep=table1?"),
     (
         "train model.loss.world_variation=1",

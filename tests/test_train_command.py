@@ -138,6 +138,40 @@ def test_auto_finds_runs_whatever_was_said_to_hydra(tmp_path, monkeypatch):
     assert prepare([own[0], own[2], "resume=auto"])[-1] == "resume=null"
 
 
+def test_folders_of_groups_are_kept_and_found_again(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own groups").mkdir()
+    place = f"hydra.searchpath=['file://{tmp_path}/own groups']"
+    for given in (["--config-dir", "own groups"], ["-cd=own groups"], [place]):
+        assert prepare([*given, "seed=1"]) == [place, "seed=1"]
+    both = prepare(["--config-dir=own groups", "hydra.searchpath=[pkg://mine]"])
+    assert both == [place.replace("]", ",pkg://mine]")]
+    with pytest.raises(ConfigError, match="--config-dir nowhere: there is no such folder"):
+        prepare(["--config-dir", "nowhere"])
+    run = tmp_path / "outputs" / "run"
+    run.mkdir(parents=True)
+    (run / "run.json").write_text('{"status": "interrupted"}')
+    (run / "overrides.txt").write_text(f"{place}\nseed=1\n")
+    found = prepare(["--run", "--config-dir", "own groups", "seed=1", "resume=auto"])
+    assert found[-2:] == [f"resume={Path('outputs/run')}", "--run"]
+    assert found.count(place) == 1
+
+
+def test_options_may_stand_between_settings(tmp_path):
+    settings = ["lrm=none", "seed=0,1"]
+    for given in (["lrm=none", "-m", "seed=0,1"], [*settings, "-m"]):
+        assert prepare(given) == [*settings, "-m"]
+    mixed = ["seed=1", "--cfg", "job", "lrm=none", "--package=model"]
+    assert prepare(mixed) == ["seed=1", "lrm=none", "--cfg", "job", "--package=model"]
+
+
+def test_a_group_that_a_run_left_out_can_be_set_again(tmp_path):
+    (tmp_path / "overrides.txt").write_text("~logger\n~callbacks.viewer\nseed=1\n")
+    for new in (["logger=csv", "callbacks.viewer.port=1"], ["~callbacks.viewer", "~logger"]):
+        assert prepare([f"resume={tmp_path}", *new])[:3] == ["seed=1", *new]
+    assert prepare([f"resume={tmp_path}"])[:3] == ["~logger", "~callbacks.viewer", "seed=1"]
+
+
 def test_a_resumed_run_may_change_options_that_it_added(tmp_path):
     added = ("+losses.a._target_=tests.plugins.Dark", "+losses.a.weight=0.1", "++seed=3")
     (tmp_path / "overrides.txt").write_text("\n".join(added) + "\n")
@@ -201,6 +235,20 @@ def test_a_run_goes_on_from_another_directory(scenes, tmp_path):
     inside.train(f"resume={run}", "trainer.max_steps=4", cwd=tmp_path / "b")
     assert metrics(run)["step"] == 4
     assert not list((tmp_path / "b").iterdir())
+
+
+def test_a_job_in_its_own_folder_finds_the_scene_of_the_command(scenes, tmp_path):
+    (tmp_path / "scenes").symlink_to(scenes)
+    run = tmp_path / "run"
+    given = (*SHORT, "data.root=scenes", "trainer.max_steps=2", "callbacks.evaluation=null")
+    place = ("hydra.job.chdir=true", f"hydra.run.dir={run}")
+    said = inside.train(*given, *place, cwd=tmp_path).stdout
+    assert not (run / "scenes").exists()
+    assert "metrics.json  checkpoints/last.ckpt" in said
+    record = (run / ".hydra" / "overrides.yaml").read_bytes()
+    refused = inside.train(*given, *place, "seed=1", cwd=tmp_path, code=1)
+    assert "holds a run already (finished)" in refused.stderr
+    assert (run / ".hydra" / "overrides.yaml").read_bytes() == record
 
 
 def test_a_stopped_sweep_says_how_the_whole_of_it_goes_on(tmp_path, monkeypatch, capsys):

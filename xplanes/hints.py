@@ -8,8 +8,11 @@ from xplanes.config import CONF, near_names, quoted
 from xplanes.errors import ConfigError
 
 
-def require_readable(arguments: Sequence[str]) -> None:
+def require_readable(arguments: Sequence[str]) -> list[str]:
     """Refuse arguments that are neither ``key=value`` nor an option of Hydra.
+
+    Returns:
+        The arguments; options come last if they stood between settings, which Hydra cannot read.
 
     Raises:
         ConfigError: With the arguments that were probably meant.
@@ -31,6 +34,8 @@ def require_readable(arguments: Sequence[str]) -> None:
         raise ConfigError(
             f"-m with {shows}: Hydra shows one run; leave -m out, and give each key one value"
         )
+    options = [word for word in arguments if word not in words]
+    return [*words, *options] if others else list(arguments)
 
 
 def _require_pairs(words: Sequence[str]) -> None:

@@ -3,6 +3,7 @@
 For a fast start, neither torch nor lightning is imported before the job begins.
 """
 
+import os
 import shlex
 import sys
 from collections.abc import Iterable, Sequence
@@ -14,6 +15,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
+from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
 
 import hydra_plugins.xplanes  # noqa: F401  # Launchers' processes need its resolvers.
@@ -107,6 +109,7 @@ class SettingsCheck(Callback):
         try:
             if (plain := _resolved(OmegaConf.masked_copy(config, names))) is None:
                 return
+            _find_root(plain)
             from xplanes.experiment import Experiment
 
             experiment = Experiment.read(plain)
@@ -115,12 +118,15 @@ class SettingsCheck(Callback):
         except XPlanesError as error:
             sys.exit(f"error: {error}")
         # Imported now, because it takes long: wrong settings have been refused.
-        from xplanes.run import KNOWN_ERRORS, prepare
+        from xplanes.run import KNOWN_ERRORS, claim, prepare
 
         try:
             # Fails here if a setting that names the run directory is missing.
             folder = config.hydra.run.dir
             _prepared[folder] = prepare(experiment, Path(folder).absolute())
+            # Hydra would write over the record of a run that is there.
+            if config.resume is None and "LOCAL_RANK" not in os.environ:
+                claim(Path(folder), resume=False)
         except KNOWN_ERRORS as error:
             sys.exit(f"error: {error}")
 
@@ -144,6 +150,13 @@ def _resolved(config: DictConfig) -> dict[str, Any] | None:
         raise
 
 
+def _find_root(plain: dict[str, Any]) -> None:
+    """Make a relative data.root absolute if the job runs in its own folder (hydra.job.chdir)."""
+    data = plain.get("data")
+    if HydraConfig.get().job.chdir and isinstance(data, dict) and isinstance(data.get("root"), str):
+        data["root"] = to_absolute_path(data["root"])
+
+
 def _job(config: DictConfig) -> float:
     """Run one job and return its score, which optimising sweepers use."""
     from xplanes.run import KNOWN_ERRORS, run
@@ -153,6 +166,7 @@ def _job(config: DictConfig) -> float:
     folder = Path(settings.runtime.output_dir)
     try:
         plain = to_plain(config)
+        _find_root(plain)
         if sweep and plain["trainer"].get("devices") not in (1, "1"):
             raise ConfigError(
                 "trainer.devices > 1 in a multirun: helper processes would start the whole sweep "
@@ -214,7 +228,7 @@ def prepare(arguments: list[str]) -> list[str]:
         ConfigError: If Hydra cannot read the arguments, or the run cannot be resumed.
         StorageError: If the folder of the run cannot be written.
     """
-    require_readable(arguments)
+    arguments = _with_searchpath(require_readable(arguments))
     mode = dict(map(key_and_value, arguments)).get("hydra.mode")
     several = mode == "MULTIRUN" or not {"-m", "--multirun"}.isdisjoint(arguments)
     _require_present_names(arguments, several=several)
@@ -222,6 +236,9 @@ def prepare(arguments: list[str]) -> list[str]:
     require_parsed([text for text in arguments if key_and_value(text)[0]])
     # Lightning passes names in quotes to the other processes of a run.
     values = {key: unquoted(value) for key, value in map(key_and_value, arguments) if key}
+    for text in arguments:
+        if (key := key_and_value(text)[0]).isalpha() and text[0] == "+" and (CONF / key).is_dir():
+            raise ConfigError(f"{text}: the group is there already; write {text.lstrip('+')}")
     for key, value in values.items():
         if value in ("null", "None") and (CONF / key).is_dir():
             known = ", ".join(sorted(path.stem for path in (CONF / key).glob("*.yaml")))
@@ -251,6 +268,27 @@ def prepare(arguments: list[str]) -> list[str]:
     return _resumed(Path(resume), arguments)
 
 
+def _with_searchpath(arguments: list[str]) -> list[str]:
+    """Write ``--config-dir`` as ``hydra.searchpath``, which is kept for a resumed run."""
+    folder, kept, words = "", [], iter(arguments)
+    for word in words:
+        option, _, value = word.partition("=")
+        if option in ("--config-dir", "-cd"):
+            folder = value or next(words)
+        else:
+            kept.append(word)
+    if not folder:
+        return arguments
+    if not Path(folder).is_dir():
+        raise ConfigError(f"--config-dir {folder}: there is no such folder")
+    place = quoted(f"file://{Path(folder).absolute()}")
+    given = next((word for word in kept if key_and_value(word)[0] == SEARCHPATH), None)
+    if given is None:
+        return [f"{SEARCHPATH}=[{place}]", *kept]
+    kept[kept.index(given)] = given.replace("[", f"[{place},", 1)
+    return kept
+
+
 def _resumed(run: Path, arguments: list[str]) -> list[str]:
     """A run's overrides, the new ones that replace or extend them, and its folder."""
     path = run / "overrides.txt"
@@ -269,7 +307,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
             "one key=value a line"
         )
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
-    changed = {key for key, _ in map(key_and_value, new) if key}
+    changed = {_key(text) for text in new}
     # Options that the run added with a plus sign are not in the configuration without it.
     added = {
         key_and_value(line)[0]: "++" if line.startswith("++") else "+"
@@ -277,7 +315,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
         if line.startswith("+")
     }
     new = [a if a[:1] in "+~" else added.get(key_and_value(a)[0], "") + a for a in new]
-    old = [line for line in text.splitlines() if line and key_and_value(line)[0] not in changed]
+    old = [line for line in text.splitlines() if line and not _gives_way(line, changed)]
     try:
         _require_present_names(old, several=False)
     except ConfigError as error:
@@ -285,7 +323,20 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
             f"resume={run}: it began with settings of an earlier version. {error}"
         ) from None
     place = quoted(str(run))
-    return [*old, *new, f"hydra.run.dir={place}", f"resume={place}"]
+    options = [a for a in new if not a.startswith("~") and not key_and_value(a)[0]]
+    new = [a for a in new if a not in options]
+    return [*old, *new, f"hydra.run.dir={place}", f"resume={place}", *options]
+
+
+def _key(override: str) -> str:
+    """Key of an override, also of one that deletes (``~key``)."""
+    return override.lstrip("+~").partition("=")[0]
+
+
+def _gives_way(line: str, changed: set[str]) -> bool:
+    """Whether a run's override is left out, because a new one sets its key or needs its group."""
+    key = _key(line)
+    return key in changed or (line[0] == "~" and any(e.startswith(f"{key}.") for e in changed))
 
 
 def _require_present_names(arguments: Sequence[str], *, several: bool) -> None:
@@ -335,8 +386,8 @@ def _latest(overrides: list[str]) -> Path | None:
 
 
 def _without_resume(overrides: Iterable[str]) -> list[str]:
-    """Overrides without those that only say which run to resume."""
-    keys = {text: key_and_value(text)[0] for text in overrides if text}
+    """Overrides without those that only say which run to resume, and without options."""
+    keys = {text: key_and_value(text)[0] for text in overrides if text and text[0] != "-"}
     left_out = {"resume", *(key for key in keys.values() if key.startswith("hydra."))}
     return sorted(t for t, key in keys.items() if key == SEARCHPATH or key not in left_out)
 

@@ -270,7 +270,9 @@ def swept(folder: Path, *task: str) -> None:
 def test_jobs_without_a_run_are_rows(tmp_path):
     swept(tmp_path, "model=six_planes,nine_planes", "seed=range(0,2)", "a.b='x,y'")
     lines = ("model=six_planes", "seed=0", "a.b='x,y'")
-    make(tmp_path / "0_a", model="six_planes", seed=0, overrides=lines)
+    run = make(tmp_path / "0_a", model="six_planes", seed=0, overrides=lines)
+    (run / ".hydra").mkdir()  # That of a command that was refused.
+    (run / ".hydra" / "overrides.yaml").write_text("- seed=9\n")
     missing = [(row.name, row.status) for row in read_rows(tmp_path)[1:]]
     assert missing == [(f"job {number}", "missing: no run") for number in (1, 2, 3)]
     written = table(tmp_path)

@@ -334,10 +334,11 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
         kept = "checkpoints/last.ckpt  "
         named = "".join(f" --plugin {name}" for name in experiment.config.get("plugins") or [])
         steps += [f"xplanes render {place}{named}", resume_command(run) + more]
+    curve = "curve.csv  " * (run / "curve.csv").is_file()
     lines += [
         f"memory   {metrics['peak_memory_bytes'] / 2**30:.1f} GB at its peak",
         f"wrote    {run}",
-        f"         metrics.json  curve.csv  {kept}{metrics.get('media', '')}",
+        f"         metrics.json  {curve}{kept}{metrics.get('media', '')}",
         *(f"{'next' if line is steps[0] else '':<9}{line}" for line in steps),
     ]
     return "\n".join(lines)

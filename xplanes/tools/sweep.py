@@ -240,13 +240,16 @@ def is_number(value: Any) -> bool:
 
 
 def run_overrides(run: Path) -> list[str]:
-    """Overrides of the command line, from Hydra's record or overrides.txt."""
+    """Overrides of the command line, from overrides.txt or Hydra's record.
+
+    Hydra also writes its record if it resumes a run in vain.
+    """
+    with suppress(OSError, UnicodeDecodeError):
+        return (run / "overrides.txt").read_text(encoding="utf-8").splitlines()
     with suppress(OSError, UnicodeDecodeError, yaml.YAMLError):
         content = yaml.safe_load((run / ".hydra" / "overrides.yaml").read_text(encoding="utf-8"))
         if isinstance(content, list):
             return [str(line) for line in content]
-    with suppress(OSError, UnicodeDecodeError):
-        return (run / "overrides.txt").read_text(encoding="utf-8").splitlines()
     return []
 
 

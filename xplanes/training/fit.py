@@ -48,7 +48,7 @@ class Trainer(lightning.Trainer):
         deterministic: Bit-identical runs; CPU only, with a budget in steps.
         tf32: On GPUs, multiply float32 matrices in TF32 (10-bit mantissa), which is faster.
         log_every_n_steps: Steps between log entries; 0 for none.
-        accumulate_grad_batches: Batches per optimiser step.
+        accumulate_grad_batches: Batches of rays, or views, per optimiser step.
         callbacks: Callbacks; a `TrainingClock` and an `Interrupt` are added.
         plugins: Lightning's plugins; checkpoints are atomic unless a plugin writes them.
         **others: As for Lightning's Trainer.

@@ -295,8 +295,7 @@ class RadianceModule(ViewScoring):
             if isinstance(callback, WeightAveraging):
                 raise ConfigError(
                     f"callbacks: {type(callback).__name__}: {type(self.model).__name__} changes "
-                    "the shapes of its parameters in training, so that they have no mean; leave it "
-                    "out"
+                    "its parameters' shapes in training, so that they have no mean; leave it out"
                 )
         # An earlier fit may have been interrupted within a step.
         self.between_updates, self._losses, self._seen = True, [], None

@@ -36,10 +36,9 @@ from xplanes.rendering.box import ray_box
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes import batches
 from xplanes.scenes.batches import DeviceBatches
-from xplanes.training.clock import SHARED, TrainingClock
+from xplanes.training.clock import SHARED, Interrupt, Stopped, TrainingClock
 from xplanes.training.diagnosis import TrainingError
 from xplanes.training.fit import warm_up_loops
-from xplanes.training.interrupt import Interrupt, Stopped
 from xplanes.training.meters import due
 from xplanes.training.scores import score_view
 

@@ -219,7 +219,8 @@ def warm_up_loops(module: RadianceModule, data: SceneDataModule, device: torch.d
 
 def rehearse(module: RadianceModule, rays: Batch) -> None:
     """Run a complete step on a copy of the field, so that its kernels are compiled."""
-    copied, state = copy.deepcopy(module.parts), module.state
+    site, state = module.site, module.state
+    copied = copy.deepcopy(module.parts, {id(site): site})  # It holds the images.
     model, sampler = copied.model, copied.sampler
     optimizer = model.optimizer([*model.groups(), *sampler.groups()])
     rendering = sampler.render(model.field, rays, state)

@@ -43,7 +43,6 @@ from xplanes.models.initialisation import (
 from xplanes.rendering.sampler import SamplerSettings
 from xplanes.scenes.source import SceneSettings
 from xplanes.settings import HOME, Range, Settings
-from xplanes.settings import leaves as values_of
 from xplanes.synthetic.pretraining.settings import PretrainingSettings
 from xplanes.training.fit import Trainer
 from xplanes.training.module import RadianceModule
@@ -571,7 +570,7 @@ def test_the_composed_configuration_survives_its_file():
         again = Experiment.read(yaml.safe_load(yaml.safe_dump(plain)))
         assert again == experiment
         assert Method.read(experiment.method.plain()) == experiment.method
-        names = {name for name, _ in values_of(experiment.method.model, "model.")}
+        names = {name for name, _ in hints_of(experiment.method.model, "model.")}
         assert names == {n for n in yaml_names(plain["model"], "model.") if "_target_" not in n}
 
 
@@ -613,7 +612,7 @@ LAYERS = (
     ("experiment", "sweeps"),
     ("preparation",),
     ("evaluation",),
-    ("hints", "run", "launch"),
+    ("run", "launch"),
     ("cli",),
     ("baselines", "synthetic", "tools"),
     ("__main__",),
@@ -629,7 +628,7 @@ WINGS = ("baselines", "synthetic", "tools")
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
 EDGES = {
-    "launch": {"config", "errors", "experiment", "files", "hints", "process", "run", "sweeps"},
+    "launch": {"config", "errors", "experiment", "files", "process", "run", "sweeps"},
     "train": {"cli"},
 }
 """What the ends of the command line may import, which must be quick to start."""

@@ -30,8 +30,8 @@ from xplanes.run import prepare as prepare_run
 from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.training import bar
+from xplanes.training.evaluation import forget_later
 from xplanes.training.fit import Estimate
-from xplanes.training.logs import forget_later
 from xplanes.training.module import RadianceModule
 
 NEAR = {

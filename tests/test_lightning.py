@@ -20,9 +20,9 @@ from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError, SceneError
 from xplanes.experiment import Experiment
 from xplanes.run import run
+from xplanes.training.building import loss_terms
 from xplanes.training.evaluation import Evaluation
 from xplanes.training.fit import Trainer
-from xplanes.training.losses import loss_terms
 
 ROOT = Path(__file__).resolve().parents[1]
 CALLBACKS = "lightning.pytorch.callbacks"

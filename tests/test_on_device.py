@@ -37,10 +37,10 @@ from xplanes.rendering.box import ray_box
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes import batches
 from xplanes.scenes.batches import DeviceBatches
-from xplanes.training.clock import SHARED, TrainingClock
+from xplanes.scenes.views import Views
+from xplanes.training.clock import SHARED, Interrupt, Stopped, TrainingClock
 from xplanes.training.diagnosis import TrainingError
 from xplanes.training.fit import warm_up_loops
-from xplanes.training.interrupt import Interrupt, Stopped
 from xplanes.training.meters import due
 from xplanes.training.scores import score_view
 
@@ -242,8 +242,10 @@ def test_a_background_is_the_same_without_a_list_of_rays(fake_gpu):
         assert (here[:4] == 0).all()
 
 
-def test_warming_up_does_all_of_a_step_and_changes_nothing(fake_gpu):
+def test_warming_up_does_all_of_a_step_and_changes_nothing(fake_gpu, monkeypatch):
     module, data, _ = trained("six", 2)
+    images = Mock(side_effect=AssertionError("images may take all memory"))
+    monkeypatch.setattr(Views, "__deepcopy__", images, raising=False)
     before = {name: value.cpu().clone() for name, value in module.state_dict().items()}
     module.zero_grad(set_to_none=True)
     with fake_device.counted() as counts:

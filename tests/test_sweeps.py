@@ -32,7 +32,7 @@ from xplanes.launch import FORMER, prepare
 from xplanes.sweeps import SMALL, jobs, look_ahead
 from xplanes.tools.published import check_published, read_published
 from xplanes.tools.sheet import check_what
-from xplanes.training.losses import loss_terms
+from xplanes.training.building import loss_terms
 
 PAPER = {
     "table1": (8, 7),

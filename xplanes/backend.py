@@ -94,12 +94,6 @@ def cpu_loops(tensor: Tensor) -> bool:
     )
 
 
-def triton_found() -> bool:
-    """Whether triton can be used; logs once if not."""
-    _settle_triton()
-    return _found("triton")
-
-
 @functools.cache
 def _settle_triton() -> None:
     """Give triton a temporary folder for compiled kernels if it cannot write to its own."""
@@ -123,12 +117,14 @@ def gpu_kernels(tensor: Tensor) -> bool:
 
     Threads add to a gradient in varying order, so results are not bit-identical.
     """
-    return (
-        tensor.device.type == "cuda"
-        and os.environ.get("XPLANES_GPU_KERNELS", "1") != "0"
-        and not torch.are_deterministic_algorithms_enabled()
-        and triton_found()
-    )
+    if (
+        tensor.device.type != "cuda"
+        or os.environ.get("XPLANES_GPU_KERNELS", "1") == "0"
+        or torch.are_deterministic_algorithms_enabled()
+    ):
+        return False
+    _settle_triton()
+    return _found("triton")
 
 
 def in_group() -> bool:

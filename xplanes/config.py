@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -138,6 +138,11 @@ def key_and_value(override: str) -> tuple[str, str]:
     """Key and value of an override; both are empty for any other argument."""
     key, equals, value = override.partition("=")
     return (key.lstrip("+~"), value) if equals and not key.startswith("-") else ("", "")
+
+
+def without(overrides: Iterable[str], *groups: str) -> list[str]:
+    """Sorted overrides, without those of the given settings and groups."""
+    return sorted(t for t in overrides if t and key_and_value(t)[0].split(".")[0] not in groups)
 
 
 def settings_and_paths(arguments: Sequence[str]) -> tuple[list[str], list[Path]]:

@@ -4,6 +4,7 @@ For a fast start, neither torch nor lightning is imported before the job begins.
 """
 
 import os
+import re
 import shlex
 import sys
 from collections.abc import Iterable, Sequence
@@ -28,13 +29,16 @@ from xplanes.config import (
     to_plain,
     unquoted,
     with_names,
+    without,
 )
 from xplanes.errors import ConfigError, XPlanesError
 from xplanes.files import StorageError, read_json, require_writable
-from xplanes.hints import require_parsed, require_readable
 from xplanes.process import STARTED, train_command
 
 SEARCHPATH = "hydra.searchpath"
+
+MAY_DIFFER = ("resume", "hydra", "trainer", "callbacks", "logger", "media", "viewer")
+"""Settings that a resumed run may change: of the Trainer, its outputs and its folder."""
 
 SHOWING = {
     *("--help", "-h", "--hydra-help", "--version", "--cfg", "-c", "--info", "-i"),
@@ -177,7 +181,7 @@ def _job(config: DictConfig) -> float:
         if auto:
             _require_same_job(folder, settings.overrides.task)
         # A resumed run needs the user's own configuration groups, too.
-        own = [text for text in settings.overrides.hydra if key_and_value(text)[0] == SEARCHPATH]
+        own = _search_paths(settings.overrides.hydra)
         task = [text for text in settings.overrides.task if key_and_value(text)[0] != "resume"]
         job = None if sweep else _prepared.pop(settings.run.dir, None)
         began = None if sweep else STARTED
@@ -199,20 +203,13 @@ def _require_same_job(folder: Path, overrides: Iterable[str]) -> None:
         kept = (folder / "overrides.txt").read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError):
         return  # Damaged: it will be overwritten.
-    before, now = ({t for t in each if not _may_differ(t)} for each in (kept, overrides))
+    before, now = (without(set(each), *MAY_DIFFER) for each in (kept, overrides))
     if before != now:
         raise ConfigError(
-            f"{folder} holds the run with {' '.join(sorted(before)) or 'no settings'}, not that "
-            f"with {' '.join(sorted(now)) or 'none'}: repeat the command of its sweep, or choose "
-            "another hydra.sweep.dir"
+            f"{folder} holds the run with {' '.join(before) or 'no settings'}, not that with "
+            f"{' '.join(now) or 'none'}: repeat the command of its sweep, or choose another "
+            "hydra.sweep.dir"
         )
-
-
-def _may_differ(override: str) -> bool:
-    """Whether a resumed run may change this setting: of the Trainer, its outputs or its folder."""
-    return not override or key_and_value(override)[0].split(".")[0] in (
-        *("resume", "hydra", "trainer", "callbacks", "logger", "media", "viewer"),
-    )
 
 
 def prepare(arguments: list[str]) -> list[str]:
@@ -287,6 +284,82 @@ def _with_searchpath(arguments: list[str]) -> list[str]:
         return [f"{SEARCHPATH}=[{place}]", *kept]
     kept[kept.index(given)] = given.replace("[", f"[{place},", 1)
     return kept
+
+
+def require_readable(arguments: Sequence[str]) -> list[str]:
+    """Refuse arguments that are neither ``key=value`` nor an option of Hydra.
+
+    Returns:
+        The arguments; options come last if they stood between settings, which Hydra cannot read.
+
+    Raises:
+        ConfigError: With the arguments that were probably meant.
+    """
+    from hydra._internal.utils import get_args_parser
+
+    chosen, others = get_args_parser().parse_known_args(list(arguments))
+    if option := next((word for word in others if word.startswith("-")), None):
+        key, equals, value = option.lstrip("-").replace("-", "_").partition("=")
+        after = [*arguments, ""][list(arguments).index(option) + 1]
+        if not equals and after and after[0] != "-" and "=" not in after:
+            value = after
+        meant = f"{key}={value or '...'}"
+        words = filter(None, (f"{option}: write {_in_shell(meant)}", near_names([meant])))
+        raise ConfigError(". ".join(words))
+    words = [*chosen.overrides, *others]
+    _require_pairs(words)
+    if chosen.multirun and (shows := (chosen.cfg and "--cfg") or (chosen.info and "--info")):
+        raise ConfigError(
+            f"-m with {shows}: Hydra shows one run; leave -m out, and give each key one value"
+        )
+    options = [word for word in arguments if word not in words]
+    return [*words, *options] if others else list(arguments)
+
+
+def _require_pairs(words: Sequence[str]) -> None:
+    """Refuse words that are not overrides, such as a value that the shell split at a space."""
+    for number, word in enumerate(words):
+        if "=" in word or word.startswith("~"):
+            continue
+        after = words[number + 1] if number + 1 < len(words) else ""
+        if after and "=" not in after and _is_key(word):
+            raise ConfigError(f"{word} {after}: write {_in_shell(f'{word}={after}')}")
+        if number == 0 or _is_key(word):
+            raise ConfigError(f"{word}: write key=value, such as data.scene=NAME or model=NAME")
+        end = next((n for n in range(number, len(words)) if "=" in words[n]), len(words))
+        whole = _in_shell(" ".join(words[number - 1 : end]))
+        raise ConfigError(f"{word}: the shell has split a value at its space; write {whole}")
+
+
+def _is_key(word: str) -> bool:
+    """Whether a word looks like the name of a setting or of a group."""
+    dotted = re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+", word)
+    return dotted is not None or word in ("seed", "resume") or (CONF / word).is_dir()
+
+
+def _in_shell(text: str) -> str:
+    """Quote a word for the shell if needed, in double quotes (as in the manual) if possible."""
+    plain = shlex.quote(text) == text or set(text) & set('"$`\\!')
+    return shlex.quote(text) if plain else f'"{text}"'
+
+
+def require_parsed(overrides: Sequence[str]) -> None:
+    """Refuse values that Hydra cannot read.
+
+    Raises:
+        ConfigError: With the override in quotes.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    parser = OverridesParser.create()
+    for override in overrides:
+        key, _, value = override.partition("=")
+        try:
+            parser.parse_override(override)
+        except HydraException as error:
+            whole = _in_shell(f"{key}={quoted(value)}")
+            raise ConfigError(f"{override}: Hydra cannot read the value; write {whole}") from error
 
 
 def _resumed(run: Path, arguments: list[str]) -> list[str]:
@@ -387,9 +460,13 @@ def _latest(overrides: list[str]) -> Path | None:
 
 def _without_resume(overrides: Iterable[str]) -> list[str]:
     """Overrides without those that only say which run to resume, and without options."""
-    keys = {text: key_and_value(text)[0] for text in overrides if text and text[0] != "-"}
-    left_out = {"resume", *(key for key in keys.values() if key.startswith("hydra."))}
-    return sorted(t for t, key in keys.items() if key == SEARCHPATH or key not in left_out)
+    settings = [text for text in overrides if text and text[0] != "-"]
+    return sorted([*without(settings, "resume", "hydra"), *_search_paths(settings)])
+
+
+def _search_paths(overrides: Iterable[str]) -> list[str]:
+    """Overrides that name folders of the user's own configuration groups."""
+    return [text for text in overrides if key_and_value(text)[0] == SEARCHPATH]
 
 
 def _newest(name: str) -> list[Path]:

@@ -4,6 +4,9 @@ Scores of several views are means of per-view scores, as in the literature. Pool
 all views first would give different numbers.
 """
 
+import math
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -32,9 +35,14 @@ def ssim(prediction: Tensor, truth: Tensor, shown: Tensor | None = None) -> floa
         shown: Pixels that count; all when None. bool [H, W]
     """
     if min(truth.shape[:2]) < 11:
-        return float("nan")
+        return math.nan
     similarity = _similarity(prediction.clamp(0, 1), truth.clamp(0, 1))
     return float(similarity.mean() if shown is None else similarity[shown].mean())
+
+
+def mean(values: Sequence[float]) -> float:
+    """Mean; NaN for no values."""
+    return math.fsum(values) / len(values) if values else math.nan
 
 
 def dissimilarity(prediction: Tensor, truth: Tensor) -> Tensor:

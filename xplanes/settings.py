@@ -7,7 +7,7 @@ hence without torch and Hydra.
 import difflib
 import math
 import types
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -111,16 +111,6 @@ class Settings:
             value = getattr(self, entry.name)
             content[entry.name] = value.plain() if isinstance(value, Settings) else value
         return content
-
-
-def leaves(settings: Settings, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted names and values of all settings."""
-    for entry in fields(settings):
-        value = getattr(settings, entry.name)
-        if isinstance(value, Settings):
-            yield from leaves(value, f"{prefix}{entry.name}.")
-        else:
-            yield f"{prefix}{entry.name}", value
 
 
 def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -13,10 +13,9 @@ from PIL import Image
 
 from xplanes.config import CONF
 from xplanes.errors import ConfigError
-from xplanes.tools.curves import _mean_curve
 from xplanes.tools.published import check_published, read_published
 from xplanes.tools.sweep import Point, read_rows
-from xplanes.tools.table import write_tables
+from xplanes.tools.table import _mean_curve, write_tables
 
 
 def make(

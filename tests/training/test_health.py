@@ -30,6 +30,7 @@ from xplanes.models.x_planes import XPlanesModel
 from xplanes.optional import MissingExtraError
 from xplanes.run import run
 from xplanes.training import building, module
+from xplanes.training.building import loss_terms
 from xplanes.training.checkpoints import find_resumable, load_checkpoint
 from xplanes.training.diagnosis import (
     TrainingError,
@@ -38,7 +39,6 @@ from xplanes.training.diagnosis import (
     unusable_gradients,
     usable,
 )
-from xplanes.training.losses import loss_terms
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import claim, keeping_settings
 

@@ -20,7 +20,7 @@ from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.tools.runs import load_run
-from xplanes.training import scores
+from xplanes.training import module
 from xplanes.training.checkpoints import AtomicCheckpointIO, load_checkpoint
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import KEPT, RunRecord, require_same_run
@@ -89,13 +89,13 @@ def test_a_run_is_not_resumed_with_other_images(train, folder):
 
 def test_the_best_is_chosen_by_the_same_views_throughout(train, monkeypatch, saved):
     """One view is scored on the way, and the others are harder by 10 dB."""
-    original = scores.score_image
+    original = module.score_image
 
     def score(image, item):
         found = original(image, item)
         return replace(found, psnr=found.psnr - 10 * (item["index"] != 0))
 
-    monkeypatch.setattr(scores, "score_image", score)
+    monkeypatch.setattr(module, "score_image", score)
     few = ("trainer.limit_val_batches=1", "callbacks.evaluation.at=[0,0.5]")
     folder = train(*few, "callbacks.checkpoints.every=99")
     assert [state["global_step"] for name, state in saved if name == "best.ckpt"] == [20, 40]

@@ -7,9 +7,10 @@ import torch
 
 from tests.training.runs import small_config
 from xplanes.files import read_rows
+from xplanes.metrics import mean
 from xplanes.run import run
 from xplanes.tools.runs import load_run
-from xplanes.training.scores import mean, score_view
+from xplanes.training.scores import score_view
 
 BOUND = 0.05
 """In dB."""

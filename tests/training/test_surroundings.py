@@ -19,9 +19,9 @@ from xplanes.evaluation import render
 from xplanes.evaluation.render import FRAMES, RunVideo, write_run_video
 from xplanes.rendering.behind import background_colour
 from xplanes.scenes.views import Scene
+from xplanes.training.building import loss_terms
 from xplanes.training.collapse import CollapseWatch
 from xplanes.training.evaluation import affordable
-from xplanes.training.losses import loss_terms
 from xplanes.training.scores import score_view
 
 STEPS = 30

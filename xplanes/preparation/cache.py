@@ -93,8 +93,7 @@ class StageCache:
             began = time.perf_counter() - warm_up.seconds
             content = make()
             seconds = time.perf_counter() - warm_up.seconds - began
-            if path is not None and self.writable:
-                _write(path, key, content, seconds)
+            self._write(path, key, content, seconds)
         return Stage(content, seconds, False, key)
 
     def find(self, name: str, inputs: Any) -> Stage | None:
@@ -103,9 +102,7 @@ class StageCache:
 
     def keep(self, name: str, inputs: Any, content: dict[str, Any], seconds: float) -> None:
         """Store a stage that was just computed."""
-        path, key = self._path(name, inputs)
-        if path is not None and self.writable:
-            _write(path, key, content, seconds)
+        self._write(*self._path(name, inputs), content, seconds)
 
     @contextmanager
     def workshop(self, name: str, inputs: Any) -> Iterator[Path]:
@@ -126,6 +123,24 @@ class StageCache:
             return None, ""
         key = fingerprint([VERSION, name, inputs])
         return self.folder / f"{name}-{key[:32]}.pt", key
+
+    def _write(self, path: Path | None, key: str, content: dict[str, Any], seconds: float) -> None:
+        """Store an entry; a failure does not stop the run."""
+        if path is None or not self.writable:
+            return
+        payload = {
+            "version": VERSION,
+            "key": key,
+            "checksum": fingerprint([content, seconds]),
+            "seconds": seconds,
+            "content": content,
+        }
+        clear_unfinished(path.parent, older_than=DAY)
+        try:
+            with replacing(path) as temporary:
+                torch.save(payload, temporary)
+        except (OSError, RuntimeError) as error:
+            logger.warning("%s could not be written (%s): it is not cached", path, error)
 
 
 def _find(path: Path | None, key: str) -> Stage | None:
@@ -148,23 +163,6 @@ def _find(path: Path | None, key: str) -> Stage | None:
         problem = f"damaged ({type(error).__name__})"
     logger.warning("%s is %s: it is computed again", path, problem)
     return None
-
-
-def _write(path: Path, key: str, content: dict[str, Any], seconds: float) -> None:
-    """Store an entry; a failure does not stop the run."""
-    payload = {
-        "version": VERSION,
-        "key": key,
-        "checksum": fingerprint([content, seconds]),
-        "seconds": seconds,
-        "content": content,
-    }
-    clear_unfinished(path.parent, older_than=DAY)
-    try:
-        with replacing(path) as temporary:
-            torch.save(payload, temporary)
-    except (OSError, RuntimeError) as error:
-        logger.warning("%s could not be written (%s): it is not cached", path, error)
 
 
 def fingerprint(value: Any) -> str:

@@ -13,7 +13,7 @@ from xplanes.errors import ConfigError
 from xplanes.fields.decoder import DECODER_OPTIONS, Decoder
 from xplanes.files import replacing, stand_in
 from xplanes.scenes.frame import Frame, check_frame, frame_content, read_frame
-from xplanes.settings import check_arguments
+from xplanes.settings import check_arguments, flatten
 
 MARK = "xplanes"
 """Metadata key of a safetensors file for values that are not tensors."""
@@ -32,8 +32,9 @@ def write_content(path: Path, content: dict[str, Any]) -> None:
             return
         from safetensors.torch import save_file
 
-        tensors, rest = _split(content)
-        tensors = {name: tensor.contiguous() for name, tensor in tensors.items()}
+        flat = flatten(content).items()
+        tensors = {name: value.contiguous() for name, value in flat if isinstance(value, Tensor)}
+        rest = _without_tensors(content)
         save_file(tensors, temporary, metadata={MARK: json.dumps(rest)})
 
 
@@ -54,20 +55,12 @@ def read_content(path: Path) -> Any:
     return content
 
 
-def _split(content: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors by dotted name, and the remaining nested dict."""
-    tensors: dict[str, Tensor] = {}
-    rest: dict[str, Any] = {}
-    for name, value in content.items():
-        if isinstance(value, Tensor):
-            tensors[name] = value
-        elif isinstance(value, dict):
-            inner, other = _split(value)
-            tensors |= {f"{name}.{key}": tensor for key, tensor in inner.items()}
-            rest[name] = other
-        else:
-            rest[name] = value
-    return tensors, rest
+def _without_tensors(content: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: _without_tensors(value) if isinstance(value, dict) else value
+        for name, value in content.items()
+        if not isinstance(value, Tensor)
+    }
 
 
 _KEYS = {"triplanes", "decoder", "decoder_config", "frame"}

@@ -24,8 +24,11 @@ from xplanes.preparation.encode import straight_alpha
 from xplanes.scenes.views import spread
 from xplanes.streams import Stream, step_generator
 
+PARTS_TIMES, PARTS_SIDE, FRAMES, FRAME_SIDE = 4, 128, 6, 160
+"""Columns of the two sheets, evenly spaced in time, and pixels per plane or frame."""
 
-def parts_sheet(low_rank: Tensor, sparse: Tensor, timesteps: int = 4, side: int = 128) -> Tensor:
+
+def parts_sheet(low_rank: Tensor, sparse: Tensor) -> Tensor:
     """Low-rank and sparse part side by side at a few timesteps, three channels as colours.
 
     Rows are xy, xz, yz. Each column is a timestep: low-rank part on the left, sparse part on the
@@ -34,13 +37,11 @@ def parts_sheet(low_rank: Tensor, sparse: Tensor, timesteps: int = 4, side: int 
     Args:
         low_rank: The static part. [T, 3, C, H, W]
         sparse: The dynamic part. [T, 3, C, H, W]
-        timesteps: Number of columns, evenly spaced in time.
-        side: Pixels per plane.
 
     Returns:
         Colours from 0 to 1. [3 (side + 4), M 2 (side + 4), 3]
     """
-    chosen = spread(timesteps, len(low_rank))
+    chosen, side = spread(PARTS_TIMES, len(low_rank)), PARTS_SIDE
     static, moving = (_colours(part[chosen]) for part in (low_rank, sparse))
     static = static - static.mean(dim=(0, 3, 4), keepdim=True)
     spread_of = 5 * static.std(dim=(0, 3, 4), correction=0, keepdim=True).clamp_min(1e-8)
@@ -61,24 +62,20 @@ def _colours(planes: Tensor) -> Tensor:
     return torch.cat([shown, shown[:, :, :1].expand(-1, -1, missing, -1, -1)], dim=2)
 
 
-def contact_sheet(
-    frames: Tensor, crop: Crop, model: LRM, timesteps: int = 6, side: int = 160
-) -> Tensor:
+def contact_sheet(frames: Tensor, crop: Crop, model: LRM) -> Tensor:
     """Contact sheet of a few frames, as the LRM sees them.
 
     Args:
         frames: Premultiplied RGBA. uint8 [T, H, W, 4]
         crop: Crop that the model is given.
         model: The model.
-        timesteps: Number of frames, evenly spaced in time.
-        side: Pixels per frame.
 
     Returns:
         Colours from 0 to 1, the frames side by side. [side, M side, 3]
     """
-    chosen = torch.tensor(spread(timesteps, len(frames)))
+    chosen = torch.tensor(spread(FRAMES, len(frames)))
     shown = model.prepare(crop.apply(straight_alpha(frames[chosen])))
-    shown = F.interpolate(shown, size=(side, side), mode="bilinear", antialias=True)
+    shown = F.interpolate(shown, size=(FRAME_SIDE, FRAME_SIDE), mode="bilinear", antialias=True)
     return shown.permute(2, 0, 3, 1).flatten(1, 2).clamp(0, 1)
 
 

@@ -11,9 +11,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from xplanes.files import is_there, write_json
+from xplanes.metrics import mean
 from xplanes.optional import require
 from xplanes.tools.runs import TrainedRun
-from xplanes.training.scores import mean, score_view
+from xplanes.training.scores import score_view
 
 logger = logging.getLogger(__name__)
 

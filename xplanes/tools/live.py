@@ -11,8 +11,7 @@ from lightning.pytorch.callbacks import Callback
 from xplanes.errors import ConfigError
 from xplanes.settings import Range
 from xplanes.tools.viewer import HOST, PORT, Viewer, check_address
-from xplanes.training.clock import find_callback, off_clock, training_seconds
-from xplanes.training.interrupt import Interrupt
+from xplanes.training.clock import Interrupt, find_callback, off_clock, training_seconds
 from xplanes.training.module import RadianceModule
 
 logger = logging.getLogger(__name__)

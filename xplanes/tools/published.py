@@ -6,8 +6,9 @@ from pathlib import Path
 
 from xplanes.errors import ConfigError
 from xplanes.files import read_rows
+from xplanes.metrics import mean
 from xplanes.tools.sweep import RunRow
-from xplanes.tools.tabulate import differing, markdown, mean, mean_part
+from xplanes.tools.tabulate import differing, markdown, mean_part
 
 KEYS = {"model": "model.name", "lrm": "lrm.name", "sampler": "model.sampler.name"}
 """Columns of published.csv, and the settings that must match them."""

@@ -113,15 +113,19 @@ class VideoOptions:
         written = None if self.cameras is None else self.cameras.fps
         return self.fps or written or FPS
 
-    @property
-    def times(self) -> Tensor:
-        """Time of each frame, from 0 to 1. [F]
+    def times(self, splits: dict[str, Views]) -> Tensor:
+        """Time of each frame, from 0 to 1, for a scene with these splits. [F]
 
         Raises:
-            ConfigError: As `times`, and for ``own``, which needs a scene.
+            ConfigError: As `times` and `find_view`.
         """
         if self.cameras is not None and self.time is None:
             return self.cameras.times
+        if self.path == "cameras" and self.time in (None, OWN):
+            return training_path(splits["train"], self.count)[1]
+        if self.time == OWN and (found := self.views(splits)) is not None:
+            views, indices = found
+            return views.times[indices]
         return times(self.time or "back-and-forth", self.count)
 
     def shape(self, splits: dict[str, Views]) -> tuple[int, int]:
@@ -131,20 +135,26 @@ class VideoOptions:
             ConfigError: As `find_view`.
         """
         height = width = max(splits["train"].height, splits["train"].width)
-        if (found := self.view(splits)) is not None:
-            views, index = found
-            height, width = views.size(index)
-        elif self.path == "cameras":
-            height, width = splits["train"].size(training_path(splits["train"], 1)[0][0])
+        if (found := self.views(splits)) is not None:
+            views, indices = found
+            height, width = views.size(indices[0])
         elif self.cameras is not None:
             height = self.cameras.height or self.cameras.width or height
             width = self.cameras.width or height
         return (height, width) if self.size is None else fitting(height, width, self.size)
 
-    def view(self, splits: dict[str, Views]) -> tuple[Views, int] | None:
-        """The view that ``path`` names, see `find_view`; None for other kinds of cameras."""
-        name = self.path.removeprefix("view:")
-        return None if name == self.path else find_view(splits, name)
+    def views(self, splits: dict[str, Views]) -> tuple[Views, list[int]] | None:
+        """The split and index of the view whose camera takes each frame; None for other cameras.
+
+        Raises:
+            ConfigError: As `find_view`.
+        """
+        if self.path == "cameras":
+            return splits["train"], training_path(splits["train"], self.count)[0]
+        if not self.path.startswith("view:"):
+            return None
+        views, index = find_view(splits, self.path.removeprefix("view:"))
+        return views, [index] * self.count
 
     def destination(self, run: Path, checkpoint: str) -> tuple[Path, bool]:
         """The file or folder to write, and whether it is a folder."""
@@ -218,20 +228,21 @@ def render_video(trained: TrainedRun, options: VideoOptions) -> Path:
     target, folder = options.destination(trained.path, trained.checkpoint)
     require_writable(target.parent)
     splits = trained.scene.splits
-    if options.time == OWN and (found := options.view(splits)) is not None:
-        views, index = found
-        options = replace(options, time=str(float(views.times[index])))
-    own = options.path == "cameras" and options.time in (None, OWN)
-    seen_at = training_path(splits["train"], options.count)[1] if own else options.times
+    shown = None
+    if (found := options.views(splits)) is not None:
+        shape = options.shape(splits)
+        views, indices = found
+        known = {index: pixels_with_rays(views, index, *shape) for index in set(indices)}
+        shown = [known[index] for index in indices]
     frames = render_path(
         trained.module.field,
         trained.module.renderer,
         trained.frame,
         cameras(options, splits, trained.frame),
-        seen_at,
+        options.times(splits),
         background=trained.scene.background,
         what=options.what,
-        shown=shown_pixels(options, splits),
+        shown=shown,
     )
     counted = tqdm(frames, "frames", options.count, leave=False, delay=2, disable=None)
     return write_video(target, counted, fps=options.rate, folder=folder)
@@ -246,27 +257,13 @@ def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> li
     if (path := options.cameras) is not None:
         focal = path.focal(rows, columns).tolist()
         return [PosedCamera(p, f, rows, columns) for p, f in zip(path.poses, focal, strict=True)]
-    if (found := options.view(splits)) is not None:
-        views, index = found
-        return [views.camera(index).resized(rows, columns)] * options.count
+    if (found := options.views(splits)) is not None:
+        views, indices = found
+        return [views.camera(index).resized(rows, columns) for index in indices]
     views, count = splits["train"], options.count
-    if options.path == "cameras":
-        return [views.camera(i).resized(rows, columns) for i in training_path(views, count)[0]]
     poses = orbit_poses(views, frame, 1 if options.path == "fixed" else count, options.elevation)
     focal = views.intrinsics.focal_at(max(rows, columns))
     return [PosedCamera(pose, focal, rows, columns) for pose in poses.expand(count, 4, 4)]
-
-
-def shown_pixels(options: VideoOptions, splits: dict[str, Views]) -> list[Tensor | None] | None:
-    """Pixels of each frame for which its lens has rays, see `render_path`."""
-    shape = options.shape(splits)
-    if (found := options.view(splits)) is not None:
-        return [pixels_with_rays(*found, *shape)] * options.count
-    if options.path != "cameras":
-        return None
-    views = splits["train"]
-    indices, _ = training_path(views, options.count)
-    return [pixels_with_rays(views, index, *shape) for index in indices]
 
 
 def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:

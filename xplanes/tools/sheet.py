@@ -16,9 +16,8 @@ from xplanes.evaluation.render import write_video
 from xplanes.files import replacing
 from xplanes.metrics import psnr
 from xplanes.rendering.pictures import STRIP
-from xplanes.tools.curves import SCENE, run_label
 from xplanes.tools.sweep import RunRow, read_rows
-from xplanes.tools.tabulate import SEED, differing, seed_groups
+from xplanes.tools.tabulate import SCENE, SEED, differing, run_label, seed_groups
 
 WHAT = ("runs", "steps", "parts")
 """runs: a row per scene, a column per run. steps: a row per run, a column per step. parts: low-rank

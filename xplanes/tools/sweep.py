@@ -8,7 +8,7 @@ import itertools
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from xplanes.config import key_and_value
+from xplanes.config import key_and_value, without
 from xplanes.errors import ConfigError
 from xplanes.files import natural
 from xplanes.files import read_rows as read_csv
@@ -262,10 +262,10 @@ def _value(text: str) -> Any:
 
 def _missing_jobs(sweep: Path, folder: Path, done: list[list[str]]) -> list[RunRow]:
     """Rows for the jobs in multirun.yaml for which no run has the same overrides."""
-    left = Counter(_settings_of(lines) for lines in done)
+    left = Counter(tuple(without(set(lines), "resume", "hydra")) for lines in done)
     rows = []
     for number, job in enumerate(_jobs(_mapping(sweep / "multirun.yaml", []) or {})):
-        key = _settings_of(job)
+        key = tuple(without(set(job), "resume", "hydra"))
         if left[key]:
             left[key] -= 1
             continue
@@ -273,12 +273,6 @@ def _missing_jobs(sweep: Path, folder: Path, done: list[list[str]]) -> list[RunR
         name = str(sweep.relative_to(folder) / f"job {number}")
         rows.append(RunRow(name, settings, frozenset(settings), status="missing: no run"))
     return rows
-
-
-def _settings_of(overrides: Iterable[str]) -> tuple[str, ...]:
-    """Sorted overrides, without those of ``resume`` and ``hydra``."""
-    groups = {text: key_and_value(text)[0].split(".")[0] for text in overrides}
-    return tuple(sorted(text for text in groups if groups[text] not in ("resume", "hydra")))
 
 
 def _jobs(multirun: dict[str, Any]) -> list[list[str]]:

@@ -1,14 +1,14 @@
 """Tables of runs: choice of columns, means over seeds, and markdown."""
 
 import json
-import math
 from collections.abc import Iterable, Sequence
-from statistics import fmean, stdev
+from statistics import stdev
 from typing import Any
 
+from xplanes.metrics import mean
 from xplanes.tools.sweep import SCORES, RunRow
 
-SEED = "seed"
+SEED, SCENE = "seed", "data.scene"
 UNLISTED = ("resume", "callbacks.evaluation.at", "media", "trainer.log_every_n_steps")
 """Settings without influence on results."""
 
@@ -79,6 +79,16 @@ def _settings(row: RunRow, names: Sequence[str]) -> Line:
     return {name: _text(row.settings[name]) if name in row.settings else "" for name in names}
 
 
+def run_label(row: RunRow, names: Sequence[str]) -> str:
+    """Label of a run: the settings in which it differs from others."""
+    parts = [
+        str(value) if name.endswith(".name") else f"{name.rsplit('.', 1)[-1]}={value}"
+        for name in names
+        if (value := row.settings.get(name)) is not None
+    ]
+    return ", ".join(parts) or "run"
+
+
 def seed_groups(rows: Sequence[RunRow]) -> list[list[RunRow]]:
     """Groups of finished runs that differ only in their seed; none if all groups have one run.
 
@@ -133,11 +143,6 @@ def mean_part(rows: Sequence[RunRow], name: str) -> float:
     """Mean of a value over the decompositions of all runs and orientations; NaN if none has it."""
     values = [part.get(name) for row in rows for part in row.parts.values()]
     return mean([value for value in values if isinstance(value, int | float)])
-
-
-def mean(values: Sequence[float]) -> float:
-    """Arithmetic mean; NaN of no values."""
-    return fmean(values) if values else math.nan
 
 
 def shown(lines: Sequence[Line]) -> str:

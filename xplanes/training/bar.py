@@ -46,10 +46,8 @@ class StepBar(ProgressBar):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        if not self._shown or not trainer.is_global_zero or time.monotonic() < self._due:
-            return
-        self._due = time.monotonic() + self._every
-        self._write(self.line(trainer, pl_module))
+        if self._is_due(trainer):
+            self._write(self.line(trainer, pl_module))
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._shown and trainer.is_global_zero:
@@ -65,13 +63,10 @@ class StepBar(ProgressBar):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        if not self._shown or not trainer.is_global_zero or time.monotonic() < self._due:
-            return
-        self._due = time.monotonic() + self._every
-        counts = trainer.num_val_batches
-        if trainer.testing or trainer.sanity_checking:
-            counts = trainer.num_test_batches if trainer.testing else trainer.num_sanity_val_batches
-        self._write(f"scoring: {batch_idx + 1} of {sum(map(int, counts))} views")
+        if self._is_due(trainer):
+            counts = trainer.num_test_batches if trainer.testing else trainer.num_val_batches
+            counts = trainer.num_sanity_val_batches if trainer.sanity_checking else counts
+            self._write(f"scoring: {batch_idx + 1} of {sum(map(int, counts))} views")
 
     on_validation_batch_end = on_test_batch_end
 
@@ -85,6 +80,13 @@ class StepBar(ProgressBar):
     ) -> None:
         if self.live and self._width:
             self.stream.write("\n")
+
+    def _is_due(self, trainer: Trainer) -> bool:
+        """Whether to show a line now; the next one is due later."""
+        now = time.monotonic()
+        due = self._shown and trainer.is_global_zero and now >= self._due
+        self._due = now + self._every if due else self._due
+        return due
 
     def line(self, trainer: Trainer, module: LightningModule) -> str:
         """The line for the current state."""

@@ -17,9 +17,8 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from xplanes.errors import ConfigError
 from xplanes.files import read_rows, replacing, stand_in
-from xplanes.training.clock import TrainingClock, off_clock
+from xplanes.training.clock import Stopped, TrainingClock, off_clock
 from xplanes.training.diagnosis import require_finite
-from xplanes.training.interrupt import Stopped
 from xplanes.training.module import RadianceModule
 
 logger = logging.getLogger(__name__)

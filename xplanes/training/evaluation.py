@@ -8,18 +8,18 @@ from typing import Any
 
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
 from xplanes.errors import ConfigError
 from xplanes.files import write_rows
+from xplanes.metrics import mean
 from xplanes.rendering.pictures import plane_sheet, strip, write_png
 from xplanes.rendering.sampler import Site
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Views
 from xplanes.training.clock import off_clock, training_seconds
-from xplanes.training.logs import forget_later
 from xplanes.training.module import RadianceModule
-from xplanes.training.scores import mean
 
 SHOWN = 4
 """Number of views whose images are logged at each evaluation."""
@@ -170,6 +170,19 @@ class Evaluation(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.seconds, self._passed = state_dict["seconds"], state_dict["passed"]
         self._rows = list(state_dict.get("rows", []))
+
+
+def forget_later(trainer: Trainer, step: int) -> None:
+    """Make TensorBoard drop points after a step, left by an interrupted run."""
+    for log in trainer.loggers:
+        if isinstance(log, TensorBoardLogger):
+            from tensorboard.compat.proto.event_pb2 import (  # pyright: ignore
+                Event,  # pyright: ignore[reportAttributeAccessIssue]
+                SessionLog,  # pyright: ignore[reportAttributeAccessIssue]
+            )
+
+            begins = Event(session_log=SessionLog(status=SessionLog.START))
+            log.experiment.file_writer.add_event(begins, step + 1)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def log_image(trainer: Trainer, tag: str, picture: Tensor, step: int) -> None:

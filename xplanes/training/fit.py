@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 import lightning
 import torch
+from lightning.fabric.utilities import move_data_to_device
 from lightning.pytorch.callbacks import Callback, ProgressBar, StochasticWeightAveraging
 from lightning.pytorch.plugins.io import CheckpointIO
 
@@ -23,13 +24,11 @@ from xplanes.scenes.batches import Batch
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Scene
 from xplanes.settings import Count, Positive, Steps
-from xplanes.training.building import require_new_rays, require_whole_floats
+from xplanes.training.building import loss_terms, require_new_rays, require_whole_floats
 from xplanes.training.checkpoints import AtomicCheckpointIO, Checkpoints, find_resumable
-from xplanes.training.clock import TrainingClock, find_callback
+from xplanes.training.clock import Interrupt, TrainingClock, find_callback
 from xplanes.training.collapse import CollapseWatch
 from xplanes.training.evaluation import Evaluation
-from xplanes.training.interrupt import Interrupt
-from xplanes.training.losses import loss_terms
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore
 
@@ -208,7 +207,7 @@ def warm_up_loops(module: RadianceModule, data: SceneDataModule, device: torch.d
     elif not cpu_loops(next(module.field.parameters())):
         return
     batches = data.batches_for(module, 0)
-    rays = _moved(batches.draw(0, 8), device)
+    rays = move_data_to_device(batches.draw(0, 8), device)
     with warming_up():
         if device.type != "cpu":
             rehearse(module, rays)
@@ -227,7 +226,8 @@ def warm_up_loops(module: RadianceModule, data: SceneDataModule, device: torch.d
 
 def rehearse(module: RadianceModule, rays: Batch) -> None:
     """Run a complete step on a copy of the field, so that its kernels are compiled."""
-    copied, state = copy.deepcopy(module.parts), module.state
+    site, state = module.site, module.state
+    copied = copy.deepcopy(module.parts, {id(site): site})  # It holds the images.
     model, sampler = copied.model, copied.sampler
     optimizer = model.optimizer([*model.groups(), *sampler.groups()])
     rendering = sampler.render(model.field, rays, state)
@@ -306,12 +306,12 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
     assert frame is not None
     device = next(field.parameters()).device
     batches = data.batches_for(module, 0)
-    rays = _moved(batches.draw(0, module.rays), device)
+    rays = move_data_to_device(batches.draw(0, module.rays), device)
     if module.rays:  # Batches soon have as many rays as the budget of samples allows.
         with torch.no_grad():
             samples = module.sampler.render(field, rays, module.state).samples
         count = module.ray_settings.fitting(module.rays, int(samples.count))
-        rays = _moved(batches.draw(0, count), device)
+        rays = move_data_to_device(batches.draw(0, count), device)
     views = data.scene.splits[data.test_split]
     camera, seen_at = views.camera(0), (float(views.times[0]), data.scene.background.to(device))
     pixels = camera.height * camera.width
@@ -348,10 +348,6 @@ def _seconds(work: Callable[[], Any], device: torch.device) -> float:
         synchronize(device)
         spent.append(time.perf_counter() - began)
     return min(spent)
-
-
-def _moved(batch: Batch, device: torch.device) -> Batch:
-    return {name: value.to(device) for name, value in batch.items()}
 
 
 def quiet_lightning() -> None:

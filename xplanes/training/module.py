@@ -9,14 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lightning import LightningModule
 from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.core.optimizer import LightningOptimizer
-from torch import Tensor, nn
+from lightning.pytorch.trainer.states import TrainerFn
+from torch import Tensor
 
 from xplanes import __version__
 from xplanes.components import plugins
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
+from xplanes.fields.base import Representation
 from xplanes.files import stand_in
 from xplanes.models.base import Model
 from xplanes.models.initialisation import Initialisation, Method
@@ -30,6 +33,7 @@ from xplanes.streams import TrainingState
 from xplanes.training.building import (
     Parts,
     build_parts,
+    loss_terms,
     parts_from,
     require_frame,
     require_new_rays,
@@ -37,6 +41,7 @@ from xplanes.training.building import (
     require_whole_floats,
     site_content,
 )
+from xplanes.training.clock import training_seconds
 from xplanes.training.diagnosis import (
     TrainingError,
     broken_flag,
@@ -44,10 +49,8 @@ from xplanes.training.diagnosis import (
     leave_out,
     unusable_gradients,
 )
-from xplanes.training.logs import log_terms, logs_now
-from xplanes.training.losses import loss_terms
 from xplanes.training.meters import Tally, batch_values, due, mean_opacities
-from xplanes.training.scores import ViewScoring
+from xplanes.training.scores import ViewScore, gathered, mean_scores, render_item, score_image
 
 PATIENCE = 20
 """Training fails after this many consecutive updates with a loss or gradient that is not finite."""
@@ -56,7 +59,7 @@ OPACITIES = 5
 """Batches between measurements of the rays' opacity."""
 
 
-class RadianceModule(ViewScoring):
+class RadianceModule(LightningModule):
     """Trains a field on rays, supervised by the images' colours.
 
     The field is built in `configure_model`, when the scene is known; a configured LRM runs there,
@@ -65,7 +68,8 @@ class RadianceModule(ViewScoring):
 
     A step is `training_step` (render the rays, sum the loss terms), `on_before_optimizer_step`
     (gradients of regularisers without rays; a step that is not finite is skipped) and
-    `optimizer_step` (the optimiser, then the update of the occupancy grid).
+    `optimizer_step` (the optimiser, then the update of the occupancy grid). Validation and test
+    score whole views, as `SceneDataModule` serves them.
 
     Args:
         config: The keys ``seed``, ``model``, ``lrm``, ``preparation``, ``decomposition`` and
@@ -76,6 +80,8 @@ class RadianceModule(ViewScoring):
     Raises:
         ConfigError: If a setting is missing or invalid, or a plug-in cannot be imported.
     """
+
+    field: Representation
 
     def __init__(self, config: Mapping[str, Any] | Method, plugins: Sequence[str] = ()) -> None:
         super().__init__()
@@ -98,8 +104,10 @@ class RadianceModule(ViewScoring):
         """Advice if the loss is not finite; the model's own when None."""
         self.between_updates = True
         """Whether no accumulated gradients are pending (see ``accumulate_grad_batches``)."""
-        self.scores = []
+        self.scores: list[ViewScore] = []
+        """Scores of the views of the last validation or test, from all processes."""
         self.tally = Tally()
+        self._tag = ""
         self._parts: Parts | None = None
         self._seen: tuple[Rendering, dict[str, Tensor]] | None = None
         self._losses: list[Tensor] = []
@@ -240,6 +248,7 @@ class RadianceModule(ViewScoring):
         return self.parts.sampler.renderer
 
     def corrected(self, poses: Tensor) -> Tensor:
+        """Poses in the world as training has corrected them. [V, 4, 4]"""
         frame = self.frame
         return poses if frame is None else self.sampler.corrected(poses, frame)
 
@@ -250,10 +259,6 @@ class RadianceModule(ViewScoring):
             for name, views in scene.splits.items()
         }
         return replace(scene, splits=splits)
-
-    @property
-    def shared_parts(self) -> list[nn.Module]:
-        return list(self.sampler.parts.values())
 
     @property
     def _ddp_params_and_buffers_to_ignore(self) -> list[str]:
@@ -302,7 +307,7 @@ class RadianceModule(ViewScoring):
 
     def on_train_start(self) -> None:
         if self.global_rank:  # What a checkpoint holds counts once, in the first process.
-            for part in self.shared_parts:
+            for part in self.sampler.parts.values():
                 for name in getattr(part, "own", ()):
                     getattr(part, name).zero_()
             self.error_map.drop_own()
@@ -332,7 +337,8 @@ class RadianceModule(ViewScoring):
         self.error_map.observe(batch, rendering.colour, rendering.shown)
         self.between_updates = False
         self._count(rendering, batch, loss)
-        log_terms(self, terms, state)
+        if self._logs_now:
+            self._log(terms, state)
         if self.trainer.world_size > 1:
             # DDP waits for the gradients of all parameters, including those that no ray reached.
             loss = loss + 0 * sum(p.sum() for p in self.parameters() if p.requires_grad)
@@ -382,10 +388,38 @@ class RadianceModule(ViewScoring):
         if known and self.batches % OPACITIES == 0:
             self.tally.opacities = mean_opacities(rendering, rays)
         self.tally.add_batch(batch_values(rendering, rays, loss))
-        if loss.device.type == "cpu" or due(self.batches) or logs_now(self.trainer):
+        if loss.device.type == "cpu" or due(self.batches) or self._logs_now:
             self._read_tally()
             if self.tally.skipped_in_a_row >= PATIENCE:
                 self._give_up()
+
+    @property
+    def _logs_now(self) -> bool:
+        """Whether the last batch is to be logged: it ends a step that Lightning logs."""
+        trainer: Any = self.trainer
+        every, loop = trainer.log_every_n_steps, trainer.fit_loop.epoch_loop
+        # Lightning's own count: it begins at 0 even if the module was loaded, and the last batches
+        # of an epoch may make a step of fewer batches.
+        step = loop._batches_that_stepped + 1
+        ends = not loop._should_accumulate()
+        return bool(every and not step % every and ends and trainer.loggers)
+
+    def _log(self, terms: Mapping[str, Tensor], state: TrainingState) -> None:
+        """Log every term of the loss, weighted."""
+        values = {name: float(term.detach()) for name, term in terms.items()}
+        values |= self.model.regularisers(state)
+        values |= self.sampler.regularisers(self.field, state)
+        entries = {f"train/{name}": value for name, value in values.items()}
+        entries |= {"train/loss": sum(values.values()), "train/psnr": self.tally.last["psnr"]}
+        entries |= {"train/steps_skipped": float(self.tally.skipped), "step": float(state.step)}
+        for group in self.trainer.optimizers[0].param_groups:
+            entries[f"lr/{group['name']}"] = group["lr"]
+        counts = self.tally.counts
+        entries["sampler/samples_per_ray"] = counts["samples"] / max(1, counts["rays"])
+        if seconds := training_seconds(self.trainer):
+            entries["time/rays_per_s"] = counts["rays"] / seconds
+            entries["time/train_s"] = seconds
+        self.log_dict(entries | self.sampler.scalars() | self.model.scalars(), batch_size=1)
 
     def _read_tally(self) -> None:
         """Read the statistics, and adapt the number of rays to the budget of samples."""
@@ -419,6 +453,56 @@ class RadianceModule(ViewScoring):
         for group, new in zip(optimizer.param_groups, fresh, strict=True):
             group["params"] = new["params"]
         optimizer.state.clear()
+
+    # Scores
+
+    def predict_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
+        """One view: ``colour`` [H, W, 3], ``opacity`` and ``depth`` [H, W]."""
+        camera = batch["camera"]
+        pose = self.corrected(camera.camera_to_world[None])[0]
+        item = batch | {"camera": replace(camera, camera_to_world=pose)}
+        return render_item(self.field, self.renderer, self.site.frame, item)
+
+    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
+        """Render and score a view; the mean scores are logged at the end of the epoch."""
+        image = self.predict_step(batch, batch_idx)
+        self.scores.append(score_image(image, batch))
+        self._tag = batch["tag"]
+        return image
+
+    test_step = validation_step
+
+    def on_validation_epoch_start(self) -> None:
+        self.agree()
+        self.scores = []
+
+    on_test_epoch_start = on_validation_epoch_start
+
+    def on_validation_epoch_end(self) -> None:
+        self.scores = gathered(self.scores, self.trainer)
+        tag = self.trainer.strategy.broadcast(self._tag)  # A process may have had no view.
+        means = {f"{tag}/{name}": value for name, value in mean_scores(self.scores).items()}
+        self.tally.last |= means
+        if self.trainer.state.fn == TrainerFn.FITTING:
+            # Lightning's own count is one less, and does not continue in a resumed run.
+            means["step"] = float(self.trainer.global_step)
+        # All processes already have the means of all views; sync_dist avoids Lightning's warning.
+        self.log_dict(means, batch_size=1, sync_dist=self.trainer.world_size > 1)
+
+    on_test_epoch_end = on_validation_epoch_end
+
+    def agree(self) -> None:
+        """Copy the sampler's buffers from the first process to all others.
+
+        Each has observed only its own rays; afterwards all score and save the same field.
+        """
+        if self._trainer is None or self._trainer.world_size == 1:
+            return
+        for part in self.sampler.parts.values():
+            own = getattr(part, "own", ())
+            for name, buffer in part.named_buffers():
+                if name not in own:
+                    torch.distributed.broadcast(buffer, src=0)
 
     # Checkpoints
 

@@ -1,24 +1,21 @@
 """Scores of views: rendered, compared with the true images, and averaged."""
 
 import math
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from lightning import LightningModule, Trainer
-from lightning.pytorch.trainer.states import TrainerFn
-from torch import Tensor, distributed, nn
+from lightning import Trainer
+from torch import Tensor, distributed
 
 from xplanes.fields.base import Representation
-from xplanes.metrics import psnr, ssim
+from xplanes.metrics import mean, psnr, ssim
 from xplanes.rendering.base import Renderer, leave_empty
 from xplanes.scenes.datamodule import whole_view
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.matte import SOLID
 from xplanes.scenes.views import Views
-from xplanes.training.meters import Tally
 
 VISIBLE = 0.05
 """Opacity above which a background pixel counts as a floater."""
@@ -160,91 +157,3 @@ def blank_psnr(views: Views, background: Tensor) -> float:
     """Mean PSNR in dB of images that show nothing but the background."""
     truths = (views.composite(index, background) for index in range(len(views)))
     return mean([psnr(background.expand_as(truth), truth) for truth in truths])
-
-
-def mean(values: Sequence[float]) -> float:
-    """Mean; NaN for no values."""
-    return math.fsum(values) / len(values) if values else math.nan
-
-
-class ViewScoring(LightningModule):
-    """Scores whole views, as `SceneDataModule` serves them, in validation and test.
-
-    Attributes:
-        field: The field that is rendered.
-        tally: Receives the means over views.
-        scores: Scores of the views of the last validation or test, from all processes.
-    """
-
-    field: Representation
-    tally: Tally
-    scores: list[ViewScore]
-    _tag = ""
-
-    @property
-    @abstractmethod
-    def frame(self) -> Frame | None:
-        """The field's frame; None before it is built."""
-
-    @property
-    @abstractmethod
-    def renderer(self) -> Renderer:
-        """Renders images of the field."""
-
-    @abstractmethod
-    def corrected(self, poses: Tensor) -> Tensor:
-        """Poses in the world as training has corrected them. [V, 4, 4]"""
-
-    @property
-    @abstractmethod
-    def shared_parts(self) -> list[nn.Module]:
-        """Modules whose buffers differ between processes during training."""
-
-    def predict_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
-        """One view: ``colour`` [H, W, 3], ``opacity`` and ``depth`` [H, W]."""
-        frame, camera = self.frame, batch["camera"]
-        assert frame is not None
-        pose = self.corrected(camera.camera_to_world[None])[0]
-        item = batch | {"camera": replace(camera, camera_to_world=pose)}
-        return render_item(self.field, self.renderer, frame, item)
-
-    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
-        """Render and score a view; the mean scores are logged at the end of the epoch."""
-        image = self.predict_step(batch, batch_idx)
-        self.scores.append(score_image(image, batch))
-        self._tag = batch["tag"]
-        return image
-
-    test_step = validation_step
-
-    def on_validation_epoch_start(self) -> None:
-        self.agree()
-        self.scores = []
-
-    on_test_epoch_start = on_validation_epoch_start
-
-    def on_validation_epoch_end(self) -> None:
-        self.scores = gathered(self.scores, self.trainer)
-        tag = self.trainer.strategy.broadcast(self._tag)  # A process may have had no view.
-        means = {f"{tag}/{name}": value for name, value in mean_scores(self.scores).items()}
-        self.tally.last |= means
-        if self.trainer.state.fn == TrainerFn.FITTING:
-            # Lightning's own count is one less, and does not continue in a resumed run.
-            means["step"] = float(self.trainer.global_step)
-        # All processes already have the means of all views; sync_dist avoids Lightning's warning.
-        self.log_dict(means, batch_size=1, sync_dist=self.trainer.world_size > 1)
-
-    on_test_epoch_end = on_validation_epoch_end
-
-    def agree(self) -> None:
-        """Copy the sampler's buffers from the first process to all others.
-
-        Each has observed only its own rays; afterwards all score and save the same field.
-        """
-        if self._trainer is None or self._trainer.world_size == 1:
-            return
-        for part in self.shared_parts:
-            own = getattr(part, "own", ())
-            for name, buffer in part.named_buffers():
-                if name not in own:
-                    distributed.broadcast(buffer, src=0)

@@ -42,8 +42,8 @@ from xplanes.synthetic.pretraining.settings import (
     published_sizes,
 )
 from xplanes.training.checkpoints import load_checkpoint
+from xplanes.training.clock import Interrupt
 from xplanes.training.fit import quiet_lightning
-from xplanes.training.interrupt import Interrupt
 
 
 def export(model: OpenLRM, config: dict[str, Any], folder: Path, name: str) -> Path:

@@ -90,8 +90,8 @@ def test_sizes_rates_and_times_can_be_set(views, tmp_path):
     written, changed = VideoOptions(path=path), VideoOptions(path=path, size=10, fps=9, time="0.5")
     assert (written.shape({"train": views}), written.rate) == ((12, 20), 4)
     assert (changed.shape({"train": views}), changed.rate) == ((6, 10), 9)
-    assert written.times.tolist() == [0.75, 0.25]
-    assert changed.times.tolist() == [0.5, 0.5]
+    assert written.times({"train": views}).tolist() == [0.75, 0.25]
+    assert changed.times({"train": views}).tolist() == [0.5, 0.5]
 
 
 def test_times_of_a_spline_that_overshoots_stay_in_range(views, tmp_path, caplog):

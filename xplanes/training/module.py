@@ -81,8 +81,6 @@ class RadianceModule(LightningModule):
         ConfigError: If a setting is missing or invalid, or a plug-in cannot be imported.
     """
 
-    field: Representation
-
     def __init__(self, config: Mapping[str, Any] | Method, plugins: Sequence[str] = ()) -> None:
         super().__init__()
         read = isinstance(config, Method)
@@ -199,7 +197,8 @@ class RadianceModule(LightningModule):
 
     def _adopt(self, parts: Parts) -> None:
         self._parts = parts
-        self.field, self.error_map = parts.field, ErrorMap(parts.site.steps(START))
+        self.field: Representation = parts.field
+        self.error_map = ErrorMap(parts.site.steps(START))
         for name, part in parts.sampler.parts.items():
             self.add_module(name, part)
         self.rays = parts.sampler.first_rays(self.ray_settings.most)

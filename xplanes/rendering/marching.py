@@ -150,19 +150,18 @@ def march_reference(
     if math.isfinite(limit):
         depth = (grid.least[cells].double() * step).clamp_max(OPAQUE) * met
         kept = met & (depth.cumsum(1) - depth < limit)
-    numbers = kept.sum(dim=1)
-    ends = numbers.cumsum(0)
-    starts, live, total, shown = ends - numbers, None, None, None
-    tally = torch.stack([inside.sum(), met.sum(), numbers.sum()])
-    candidates, found, left = tally if room is not None else tally.tolist()
+    running = kept.flatten().cumsum(0)
+    ends = running.view(count, steps)[:, -1]
+    starts, live, total, shown = ends - kept.sum(dim=1), None, None, None
+    candidates, found = inside.sum(), met.sum()
     if room is None:
+        candidates, found, left = torch.stack([candidates, found, kept.sum()]).tolist()
         place = kept.flatten().nonzero()[:, 0]
     else:
-        shown = ends <= room
+        left, shown = running[-1], ends <= room
         total = (ends * shown).amax()
         slot = torch.arange(room, device=near.device)
         starts, live = torch.minimum(starts, total), slot < total
-        running = kept.flatten().cumsum(0)
         place = torch.searchsorted(running, slot + 1).clamp_max_(count * steps - 1)
     ray = torch.div(place, steps, rounding_mode="floor")
     distances = distances.flatten()[place]

@@ -507,7 +507,7 @@ def stub(thing: Any, members: Iterable[str] | None) -> list[str]:
                 else:
                     parts[-1] += " ..."
         elif isinstance(below, ast.AnnAssign | ast.Assign):
-            if isinstance(below.value, ast.Name):  # Another name of a method.
+            if isinstance(below, ast.Assign) and isinstance(below.value, ast.Name):  # An alias.
                 continue
             first = below.lineno - 1
             while lines[first - 1].startswith("    # "):

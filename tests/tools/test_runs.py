@@ -82,7 +82,7 @@ def changed(run: Path, name: str, **changes: Any) -> dict[str, Any]:
         ("config.yaml", "text\n", "not a mapping"),
         ("checkpoints/last.ckpt", "text", "cannot be read"),
         ("checkpoints/last.ckpt", {"weights": torch.zeros(3)}, "not a checkpoint of xplanes"),
-        ("checkpoints/last.ckpt", None, "does not exist; take best.ckpt"),
+        ("checkpoints/last.ckpt", None, "does not exist; try best.ckpt"),
     ],
 )
 def test_damaged_files_are_named(copied, file, content, words):

@@ -199,7 +199,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
                 "(--checkpoint last)"
             )
         if path.name == LAST and beside.is_file():
-            raise ConfigError(f"{path} does not exist; take {BEST} (--checkpoint best)")
+            raise ConfigError(f"{path} does not exist; try {BEST} beside it")
         raise ConfigError(
             f"{path} does not exist: the run stopped before its first checkpoint "
             "(callbacks.checkpoints.every)"

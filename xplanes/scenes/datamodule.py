@@ -101,7 +101,9 @@ class SceneDataModule(LightningDataModule):
             scene: The scene.
             seed: Seed for drawing rays.
         """
-        data = cls(_GivenScene.around(scene), seed=seed)
+        data = cls.__new__(cls)
+        # Not through a subclass, which may have arguments of its own.
+        SceneDataModule.__init__(data, _GivenScene.around(scene), seed=seed)
         data.scene = scene
         return data
 

@@ -163,7 +163,7 @@ def _similar(image: Path) -> Path | None:
     wanted = image.stem if image.suffix.lower() in ENDINGS else image.name
     found = _stems(parent).get(_normalised(wanted), [])
     same = [path for path in found if _normalised(path.name) == _normalised(image.name)]
-    chosen = same or found
+    chosen = [path for path in same if path.suffix == image.suffix] or same or found
     return chosen[0] if len(chosen) == 1 else None
 
 

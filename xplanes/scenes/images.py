@@ -173,7 +173,8 @@ def read_images(
     try:
         return store.images(sizes, jobs, sources + masks, recipe, has_alpha, cache)
     except SceneError:
-        all_of(Picture.decoded, pictures)  # Reports all files that fail.
+        # Reports all files that fail, without keeping what the others decode to.
+        all_of(lambda picture: picture.decoded().size, pictures)
         raise
 
 

@@ -225,7 +225,7 @@ def prepare(arguments: list[str]) -> list[str]:
         ConfigError: If Hydra cannot read the arguments, or the run cannot be resumed.
         StorageError: If the folder of the run cannot be written.
     """
-    arguments = _with_searchpath(require_readable(arguments))
+    arguments = require_readable(_with_searchpath(arguments))
     mode = dict(map(key_and_value, arguments)).get("hydra.mode")
     several = mode == "MULTIRUN" or not {"-m", "--multirun"}.isdisjoint(arguments)
     _require_present_names(arguments, several=several)
@@ -271,7 +271,7 @@ def _with_searchpath(arguments: list[str]) -> list[str]:
     for word in words:
         option, _, value = word.partition("=")
         if option in ("--config-dir", "-cd"):
-            folder = value or next(words)
+            folder = value or next(words, "")
         else:
             kept.append(word)
     if not folder:

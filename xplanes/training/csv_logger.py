@@ -33,6 +33,8 @@ class _Writer(ExperimentWriter):
         self._earlier: list[Any] = [
             row for row in rows if None not in (*row, *row.values()) and row["step"].isdigit()
         ]
+        if not self._earlier:
+            Path(self.metrics_file_path).unlink(missing_ok=True)
 
     def log_metrics(self, metrics_dict: dict[str, float], step: int | None = None) -> None:
         if step is not None and self._earlier:

@@ -106,7 +106,7 @@ class Evaluation(Callback):
         due = sum(share <= pl_module.progress for share in self.at) > self._passed
         # With min_steps training goes on after the budget is used up.
         ends = trainer.should_stop and trainer.fit_loop._can_stop_early
-        ends |= trainer.global_step >= trainer.max_steps >= 0
+        ends |= pl_module.global_step >= pl_module._steps
         ends &= pl_module.progress >= 1
         if (due or ends) and pl_module.between_updates:
             # Lightning validates after multiples of this number of batches, so it does so now.

@@ -148,6 +148,9 @@ def test_a_row_that_was_cut_off_does_not_end_the_csv(tmp_path, rest):
         file.write(rest)
     log(9)
     assert [row["step"] for row in rows(tmp_path)] == ["3", "9"]
+    (tmp_path / "csv" / "metrics.csv").write_text("step,train/loss,val/psnr\n3,")
+    log(9)
+    assert [row["step"] for row in rows(tmp_path)] == ["9"]
 
 
 def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(scenes, tmp_path, trained_run):

@@ -181,8 +181,9 @@ class Lines(Logger):
         pass
 
 
-def test_evaluations_join_a_fit_that_builds_the_field(config, tmp_path):
-    fit = trainer(tmp_path, max_steps=4, callbacks=[Evaluation(at=[0, 0.5])])
+@pytest.mark.parametrize("limits", [{"max_steps": 4}, {"max_epochs": 2, "limit_train_batches": 2}])
+def test_evaluations_join_a_fit_that_builds_the_field(config, tmp_path, limits):
+    fit = trainer(tmp_path, **limits, callbacks=[Evaluation(at=[0, 0.5])])
     module, data = RadianceModule(config), SceneDataModule(config["data"])
     fit.fit(module, data)
     rows = list(csv.DictReader((tmp_path / "curve.csv").open()))

@@ -148,6 +148,11 @@ def test_folders_of_groups_are_kept_and_found_again(tmp_path, monkeypatch):
     assert both == [place.replace("]", ",pkg://mine]")]
     with pytest.raises(ConfigError, match="--config-dir nowhere: there is no such folder"):
         prepare(["--config-dir", "nowhere"])
+    # Hydra looks for a configuration of the user's own before it reads the search path.
+    named = ["--config-dir", "own groups", "-cn", "mine", "seed=1"]
+    assert prepare(named) == named
+    option = prepare(["-m", "--config-dir", "own groups", "seed=1"])
+    assert option == [place, "seed=1", "-m"]
     run = tmp_path / "outputs" / "run"
     run.mkdir(parents=True)
     (run / "run.json").write_text('{"status": "interrupted"}')
@@ -170,6 +175,11 @@ def test_a_group_that_a_run_left_out_can_be_set_again(tmp_path):
     for new in (["logger=csv", "callbacks.viewer.port=1"], ["~callbacks.viewer", "~logger"]):
         assert prepare([f"resume={tmp_path}", *new])[:3] == ["seed=1", *new]
     assert prepare([f"resume={tmp_path}"])[:3] == ["~logger", "~callbacks.viewer", "seed=1"]
+    (tmp_path / "overrides.txt").write_text("+logger.csv.save_dir=here\nmodel=nine_planes\n")
+    new = ["~logger.csv.save_dir", "--cfg", "job", "--package", "model"]
+    found = prepare([f"resume={tmp_path}", *new])
+    assert found[:3] == ["+logger.csv.save_dir=here", "model=nine_planes", new[0]]
+    assert found[-4:] == new[1:]
 
 
 def test_a_resumed_run_may_change_options_that_it_added(tmp_path):

@@ -158,7 +158,7 @@ def _find_root(plain: dict[str, Any]) -> None:
     """Make a relative data.root absolute if the job runs in its own folder (hydra.job.chdir)."""
     data = plain.get("data")
     if HydraConfig.get().job.chdir and isinstance(data, dict) and isinstance(data.get("root"), str):
-        data["root"] = to_absolute_path(data["root"])
+        data["root"] = to_absolute_path(str(Path(data["root"]).expanduser()))
 
 
 def _job(config: DictConfig) -> float:
@@ -266,10 +266,16 @@ def prepare(arguments: list[str]) -> list[str]:
 
 
 def _with_searchpath(arguments: list[str]) -> list[str]:
-    """Write ``--config-dir`` as ``hydra.searchpath``, which is kept for a resumed run."""
+    """Write ``--config-dir`` as ``hydra.searchpath``, which is kept for a resumed run.
+
+    Left as it is beside ``--config-name``: Hydra looks for that file before it reads the search
+    path.
+    """
     folder, kept, words = "", [], iter(arguments)
     for word in words:
         option, _, value = word.partition("=")
+        if option in ("--config-name", "-cn"):
+            return arguments
         if option in ("--config-dir", "-cd"):
             folder = value or next(words, "")
         else:
@@ -282,7 +288,7 @@ def _with_searchpath(arguments: list[str]) -> list[str]:
     given = next((word for word in kept if key_and_value(word)[0] == SEARCHPATH), None)
     if given is None:
         return [f"{SEARCHPATH}=[{place}]", *kept]
-    kept[kept.index(given)] = given.replace("[", f"[{place},", 1)
+    kept[kept.index(given)] = given.replace("[", f"[{place},", 1).replace(",]", "]")
     return kept
 
 
@@ -380,7 +386,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
             "one key=value a line"
         )
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
-    changed = {_key(text) for text in new}
+    changed = {key for key, _ in map(key_and_value, new) if key}
     # Options that the run added with a plus sign are not in the configuration without it.
     added = {
         key_and_value(line)[0]: "++" if line.startswith("++") else "+"
@@ -389,6 +395,7 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     }
     new = [a if a[:1] in "+~" else added.get(key_and_value(a)[0], "") + a for a in new]
     old = [line for line in text.splitlines() if line and not _gives_way(line, changed)]
+    old = [line for line in old if line[0] != "~" or line not in new]
     try:
         _require_present_names(old, several=False)
     except ConfigError as error:
@@ -401,14 +408,9 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     return [*old, *new, f"hydra.run.dir={place}", f"resume={place}", *options]
 
 
-def _key(override: str) -> str:
-    """Key of an override, also of one that deletes (``~key``)."""
-    return override.lstrip("+~").partition("=")[0]
-
-
 def _gives_way(line: str, changed: set[str]) -> bool:
     """Whether a run's override is left out, because a new one sets its key or needs its group."""
-    key = _key(line)
+    key = line.lstrip("+~").partition("=")[0]  # Also of one that deletes (~key).
     return key in changed or (line[0] == "~" and any(e.startswith(f"{key}.") for e in changed))
 
 

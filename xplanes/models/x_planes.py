@@ -284,7 +284,8 @@ class XPlanesModel(Model):
         self.opacity = self.weights.opacity
         self._opaque = site.views is not None and site.views.is_opaque
         self.product: SparseProduct | None = None
-        self.initial_weight, self._initial = 0.0, []
+        self.initial_weight = 0.0
+        self._initial: list[tuple[Tensor, Tensor]] = []
         if initial is not None:
             self.initial_weight = self.weights.initial_weight / views**2
             if initial.sparse is not None and field.time is not None and self.weights.sparse_weight:
@@ -295,7 +296,8 @@ class XPlanesModel(Model):
                     reduction=self.weights.sparse_reduction,
                 )
         if self.initial_weight:
-            self._initial = [plane.detach().clone() for plane in self._planes]
+            stacks = [field.space] if field.time is None else [field.space, field.time]
+            self._initial = [(stack, stack.detach().clone()) for stack in stacks]
         self.advice = (
             f"Lower model.plane_lr={settings.plane_lr} or model.decoder_lr={settings.decoder_lr}"
         )
@@ -307,10 +309,6 @@ class XPlanesModel(Model):
     @property
     def sparse(self) -> Tensor | None:
         return None if self.product is None else self.product.sparse
-
-    @property
-    def _planes(self) -> list[Tensor]:
-        return [p for p in (self._field.space, self._field.time) if p is not None]
 
     def groups(self) -> list[Group]:
         field, settings = self._field, self.settings
@@ -366,9 +364,9 @@ class XPlanesModel(Model):
             self._initial, self.product = [], None  # Frees memory: both are large.
         elif self.initial_weight:
             # The field may have been moved to another device.
-            self._initial = [plane.to(field.space.device) for plane in self._initial]
+            self._initial = [(plane, initial.to(plane.device)) for plane, initial in self._initial]
             weight = fading * self.initial_weight * every
-            for plane, initial in zip(self._planes, self._initial, strict=True):
+            for plane, initial in self._initial:
                 if plane.grad is not None:
                     add_distance_gradient(plane.grad, plane, initial, weight)
         for plane, dims, weight in self._variation().values():
@@ -428,9 +426,9 @@ class XPlanesModel(Model):
 
     def _distance(self) -> float:
         """Mean squared distance from the initial values, summed over the stacks of planes."""
-        pairs = zip(self._planes, self._initial, strict=True)
         return sum(
-            float((plane - initial.to(plane.device)).square().mean()) for plane, initial in pairs
+            float((plane - initial.to(plane.device)).square().mean())
+            for plane, initial in self._initial
         )
 
     def _passing(self, step: int) -> float:

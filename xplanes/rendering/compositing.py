@@ -2,11 +2,9 @@
 
 import functools
 import importlib
-import math
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -147,12 +145,9 @@ class _Composite(torch.autograd.Function):
         cpu = compiled("xplanes.rendering.rays_numba")
         inputs = [t.contiguous() for t in (optical_depth, colour, distances, starts)]
         weights = torch.empty_like(optical_depth)
-        before = torch.zeros(len(starts), dtype=torch.float64)
-        total = optical_depth.new_zeros(len(starts), 5)
+        total = optical_depth.new_empty(len(starts), 5)
         arrays = [t.detach().numpy() for t in inputs]
-        results = (t.numpy() for t in (before, weights, total))
-        rays = np.arange(len(starts))
-        cpu.composite(*arrays[:3], rays, arrays[3], OPAQUE, math.inf, *results)
+        cpu.composite(*arrays, OPAQUE, weights.numpy(), total.numpy())
         ctx.save_for_backward(*inputs, weights)
         ctx.mark_non_differentiable(weights)
         return total, weights

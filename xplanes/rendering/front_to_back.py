@@ -62,9 +62,7 @@ def front_to_back(
         cpu.take_samples(*places, _arrays(ray, points, distances))
         colour, density = shade(field, points, times, directions, ray)
         numbers = (density * step).to(distances.dtype), colour.to(distances.dtype), distances
-        weights = torch.empty_like(distances)
-        results = _arrays(depth, weights, total)
-        cpu.composite(*_arrays(*numbers, rays, starts), OPAQUE, limit, *results)
+        cpu.composite_on(*_arrays(*numbers, rays, starts), OPAQUE, limit, *_arrays(depth, total))
         first[rays] += counts
         rays = rays[(first[rays] < ends[rays]) & (depth[rays] < limit)]
     return total.to(directions.dtype)

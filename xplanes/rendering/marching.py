@@ -142,26 +142,28 @@ def march_reference(
     half = 0.5 * grid.resolution
     cells = grid.bins(times)[:, None]
     for axis in (2, 1, 0):
-        place = (origins[:, axis, None] + distances * directions[:, axis, None] + 1) * half
+        place = distances * directions[:, axis, None]
+        place = place.add_(origins[:, axis, None]).add_(1).mul_(half)
         cells = cells * grid.resolution + place.long().clamp_(0, grid.resolution - 1)
     inside = distances < far[:, None]
     met = inside if occupied is None else inside & occupied[cells]
     kept = met
     if math.isfinite(limit):
-        depth = (grid.least[cells].double() * step).clamp_max(OPAQUE) * met
-        kept = met & (depth.cumsum(1) - depth < limit)
-    running = kept.flatten().cumsum(0)
-    ends = running.view(count, steps)[:, -1]
-    starts, live, total, shown = ends - kept.sum(dim=1), None, None, None
+        depth = grid.least[cells].double().mul_(step).clamp_max_(OPAQUE).mul_(met)
+        kept = met & (depth.cumsum(1).sub_(depth) < limit)
+    numbers, live, total, shown = kept.sum(dim=1), None, None, None
     candidates, found = inside.sum(), met.sum()
     if room is None:
-        candidates, found, left = torch.stack([candidates, found, kept.sum()]).tolist()
+        starts = numbers.cumsum(0) - numbers
+        candidates, found, left = torch.stack([candidates, found, numbers.sum()]).tolist()
         place = kept.flatten().nonzero()[:, 0]
     else:
+        running = kept.flatten().cumsum(0)
+        ends = running.view(count, steps)[:, -1]
         left, shown = running[-1], ends <= room
         total = (ends * shown).amax()
         slot = torch.arange(room, device=near.device)
-        starts, live = torch.minimum(starts, total), slot < total
+        starts, live = torch.minimum(ends - numbers, total), slot < total
         place = torch.searchsorted(running, slot + 1).clamp_max_(count * steps - 1)
     ray = torch.div(place, steps, rounding_mode="floor")
     distances = distances.flatten()[place]

@@ -17,17 +17,8 @@ def cell(place, size):
 
 
 @njit(exact=True, forceinline=True)
-def place_of(r, n, way, step):
-    """Distance of the n-th place for a sample on ray r."""
-    _, _, _, near, jitter = way
-    return near[r] + (n + jitter[r]) * step
-
-
-@njit(exact=True, forceinline=True)
-def cell_to_sample(r, distance, way, chosen):
+def cell_to_sample(r, distance, start, slope, bins, occupied, size, skip):
     """Index of the cell of ray r at a distance; -1 if no sample is placed there."""
-    start, slope, bins, _, _ = way
-    occupied, size, skip = chosen
     x = cell(start[r, 0] + distance * slope[r, 0], size)
     y = cell(start[r, 1] + distance * slope[r, 1], size)
     z = cell(start[r, 2] + distance * slope[r, 2], size)
@@ -45,19 +36,21 @@ def count_samples(way, step, chosen, far, least, limit, counts):
     near end and its jitter. ``chosen`` tells which cells are occupied, how many lie along a side,
     and whether empty ones are skipped.
     """
-    for r in prange(len(far)):
+    start, slope, bins, near, jitter = way
+    occupied, size, skip = chosen
+    for r in prange(len(near)):
         candidates, found, visible = 0, 0, 0
         depth = 0.0
-        distance = place_of(r, 0, way, step)
+        distance = near[r] + jitter[r] * step
         while distance < far[r]:
             candidates += 1
-            index = cell_to_sample(r, distance, way, chosen)
+            index = cell_to_sample(r, distance, start, slope, bins, occupied, size, skip)
             if index >= 0:
                 found += 1
                 if depth < limit:
                     visible += 1
                     depth += least[index] * step
-            distance = place_of(r, candidates, way, step)
+            distance = near[r] + (candidates + jitter[r]) * step
         counts[0, r], counts[1, r], counts[2, r] = candidates, found, visible
 
 
@@ -65,15 +58,17 @@ def count_samples(way, step, chosen, far, least, limit, counts):
 def fill_samples(line, way, step, chosen, places):
     """Place the samples that were counted; ``way`` and ``chosen`` as in `count_samples`."""
     origins, directions = line
+    start, slope, bins, near, jitter = way
+    occupied, size, skip = chosen
     starts, counts, ray, distances, cells, points = places
-    for r in prange(len(starts)):
+    for r in prange(len(near)):
         place = starts[r]
         end = place + counts[r]
         candidate = 0
         while place < end:
-            distance = place_of(r, candidate, way, step)
+            distance = near[r] + (candidate + jitter[r]) * step
             candidate += 1
-            index = cell_to_sample(r, distance, way, chosen)
+            index = cell_to_sample(r, distance, start, slope, bins, occupied, size, skip)
             if index >= 0:
                 ray[place], distances[place], cells[place] = r, distance, index
                 for axis in range(3):
@@ -100,6 +95,30 @@ def observe_cells(cells, observed, allowed, density, least, occupied, decay, tru
         occupied[cells[n]] = density[cells[n]] > empty
 
 
+@njit(parallel=True)
+def composite(optical_depth, colour, distances, starts, opaque, weights, total):
+    """Weights of the samples, and colour, opacity and depth of the rays."""
+    rays = len(starts)
+    for r in prange(rays):
+        end = starts[r + 1] if r + 1 < rays else len(optical_depth)
+        before = 0.0
+        red, green, blue, opacity, far = 0.0, 0.0, 0.0, 0.0, 0.0
+        for n in range(starts[r], end):
+            depth = max(min(np.float64(optical_depth[n]), opaque), 0.0)
+            if np.isnan(optical_depth[n]):
+                depth = np.nan
+            weight = np.exp(-before) * -np.expm1(-depth)
+            before += depth
+            weights[n] = weight
+            red += weight * colour[n, 0]
+            green += weight * colour[n, 1]
+            blue += weight * colour[n, 2]
+            far += weight * distances[n]
+            opacity += weight
+        total[r, 0], total[r, 1], total[r, 2] = red, green, blue
+        total[r, 3], total[r, 4] = opacity, far
+
+
 @njit(exact=True, parallel=True)
 def take_samples(rays, first, starts, points, distances, taken):
     """Gather the next samples of some rays contiguously."""
@@ -114,13 +133,8 @@ def take_samples(rays, first, starts, points, distances, taken):
 
 
 @njit(parallel=True)
-def composite(
-    optical_depth, colour, distances, rays, starts, opaque, limit, before, weights, total
-):
-    """Add the next samples of some rays to their colour, opacity and depth.
-
-    A ray ends once ``before``, the optical depth in front, exceeds ``limit``.
-    """
+def composite_on(optical_depth, colour, distances, rays, starts, opaque, limit, before, total):
+    """Continue `composite` on rays with their next samples, up to a limit of optical depth."""
     for i in prange(len(rays)):
         r = rays[i]
         end = starts[i + 1] if i + 1 < len(rays) else len(optical_depth)
@@ -134,7 +148,6 @@ def composite(
                 depth = np.nan
             weight = np.exp(-passed) * -np.expm1(-depth)
             passed += depth
-            weights[n] = weight
             red += weight * colour[n, 0]
             green += weight * colour[n, 1]
             blue += weight * colour[n, 2]

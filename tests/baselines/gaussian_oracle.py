@@ -40,24 +40,18 @@ def projected(mean, quaternion, scale, camera):
     return middle, seen, z
 
 
-def splat(given, camera, background=None, antialiased=False, pixels=None, slack=0.0):
-    """Colour, opacity and expected depth of pixels (x, y); of the whole image when None.
+def splat(given, camera, background=None, antialiased=False):
+    """Colour, opacity and expected depth of an image.
 
     Args:
         given: means, quaternions, scales, opacities, colours.
         camera: See `xplanes.baselines.gaussians.camera`.
         background: [C]
         antialiased: Mip-Splatting's compensation.
-        pixels: [P, 2]
-        slack: Share by which both thresholds are raised.
     """
     means, quaternions, scales, opacities, colours = (np.asarray(a, np.float64) for a in given)
-    if pixels is None:
-        y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-        shape = (camera.height, camera.width)
-    else:
-        x, y = np.asarray(pixels, np.float64).T
-        shape = (len(x),)
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    shape = (camera.height, camera.width)
     left, done = np.ones(shape), np.zeros(shape, bool)
     colour, opacity, depth = np.zeros((*shape, colours.shape[1])), np.zeros(shape), np.zeros(shape)
     pose = camera.world_to_camera.double().numpy()
@@ -77,8 +71,8 @@ def splat(given, camera, background=None, antialiased=False, pixels=None, slack=
         alpha = np.minimum(
             peak * np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy)), 0.999
         )
-        drawn = (alpha >= (1 + slack) / 255) & ~done
-        done |= drawn & (left * (1 - alpha) < 1e-4 * (1 + slack))
+        drawn = (alpha >= 1 / 255) & ~done
+        done |= drawn & (left * (1 - alpha) < 1e-4)
         weight = np.where(drawn & ~done, alpha * left, 0)
         colour += weight[..., None] * colours[n]
         opacity += weight

@@ -6,6 +6,7 @@ import itertools
 import pytest
 import yaml
 
+from tests.baselines.runs import under
 from tests.test_sweeps import jobs_of
 from tests.training.runs import changed
 from xplanes.config import CONF
@@ -59,14 +60,9 @@ tensor4d:
 
 
 OURS = (
-    "model.rays.per_batch=auto",
-    "model.rays.samples_per_batch=auto",
-    "model.rays.skip_background=true",
-    "model.rays.background=white",
-    "model.rays.background_share=0.4",
-    "model.rays.background_jitter=0.1",
-    "model.rays.error_share=0.5",
-    "model.rays.match_exposure=true",
+    *under("model.rays", per_batch="auto", samples_per_batch="auto", error_share=0.5),
+    *under("model.rays", background="white", background_share=0.4, background_jitter=0.1),
+    *under("model.rays", skip_background="true", match_exposure="true"),
 )
 """The rays of X-Planes, for models that bring others."""
 
@@ -74,7 +70,6 @@ OURS = (
 composed = functools.partial(changed, ())
 
 
-@pytest.mark.slow
 def test_a_baseline_brings_its_published_steps():
     for model, experiment in itertools.product(PUBLISHED, ([], ["experiment=published"])):
         case = model, *experiment
@@ -91,7 +86,6 @@ def test_a_baseline_brings_its_published_steps():
             assert longer["trainer"]["max_steps"] == 7, case
 
 
-@pytest.mark.slow
 def test_a_model_brings_its_initialisation_and_changes_no_other_group():
     for path in sorted((CONF / "model").glob("*.yaml")):
         chosen = [node for node in yaml.safe_load(path.read_text())["defaults"] if node != "_self_"]
@@ -118,24 +112,21 @@ def test_a_baseline_has_its_published_settings():
 
 
 def test_a_baseline_can_be_trained_on_the_rays_of_others():
+    """Given overrides win over what the baseline brings."""
     ours, plain = composed(), composed("model=kplanes", *OURS)
     assert plain["trainer"] == ours["trainer"]
     assert plain["data"] == ours["data"]
     assert plain["model"]["rays"] == ours["model"]["rays"]
 
 
-def test_the_command_line_takes_precedence():
-    rays = composed("model=kplanes", "model.rays.per_batch=7", "model.rays.background=white")
-    rays = rays["model"]["rays"]
-    assert rays["per_batch"] == 7
-    assert rays["background"] == "white"
-
-
 def row(config, *overridden):
     return RunRow("run", flatten(config), frozenset(overridden))
 
 
-def test_tables_leave_out_what_follows_from_the_model():
+def test_tables_leave_out_what_follows_from_the_model_and_the_sampler():
+    samplers = ([], ["model/sampler=occupancy"])
+    rows = [row(composed("model=kplanes", *choice)) for choice in samplers]
+    assert set(differing(rows)) == {"model.sampler.name"}
     models = ("six_planes", "kplanes", "tineuvox_s")
     names = {"model.sampler.name", "model.name"}
     rows = [row(composed("lrm=none", f"model={model}")) for model in models]
@@ -147,25 +138,14 @@ def test_tables_leave_out_what_follows_from_the_model():
     assert set(differing(rows)) == {*names, typed}
 
 
-def test_tables_leave_out_what_follows_from_the_sampler():
-    samplers = ([], ["model/sampler=occupancy"])
-    rows = [row(composed("model=kplanes", *choice)) for choice in samplers]
-    assert set(differing(rows)) == {"model.sampler.name"}
+@pytest.mark.parametrize(("sweep", "steps"), [("fair", 30000), ("lego_models", 1000000)])
+def test_comparisons_give_all_models_the_same(sweep, steps):
+    plains = [composed(*job) for job in jobs_of(f"sweep={sweep}", "data.scene=lego")]
+    assert {plain["trainer"]["max_steps"] for plain in plains} == {steps}
+    found = {(plain["trainer"]["max_seconds"], plain["data"]["resolution"]) for plain in plains}
+    assert len(found) == 1
 
 
-@pytest.mark.slow
-def test_comparisons_give_all_models_the_same():
-    for name, steps in (("fair", 30000), ("lego_models", 1000000)):
-        found = set()
-        for job in jobs_of(f"sweep={name}", "data.scene=lego"):
-            plain = composed(*job)
-            trainer = plain["trainer"]
-            assert trainer["max_steps"] == steps, job
-            found.add((trainer["max_seconds"], plain["data"]["resolution"]))
-        assert len(found) == 1, name
-
-
-@pytest.mark.slow
 def test_the_papers_first_table_has_the_published_steps():
     for job in jobs_of("sweep=table1", "data.scene=lego"):
         plain = composed(*job)

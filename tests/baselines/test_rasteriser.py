@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 import sys
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 
 from tests.baselines import gaussian_oracle as oracle
 from xplanes.backend import threads
+from xplanes.baselines import networks
 from xplanes.baselines.gaussians import rasteriser_cuda
 from xplanes.baselines.gaussians.camera import Camera
 from xplanes.baselines.gaussians.harmonics import spherical_harmonics
@@ -25,10 +27,9 @@ TOLERANCE = {"loops": 5e-6, "float32": 5e-6, "float64": 1e-9}
 
 
 def camera_of(width=23, height=18, distance=4.0, near=0.01, far=100.0):
-    pose = camera_around(40, 25, distance)
     focal, centre = (1.3 * width, 1.25 * width), (0.5 * width + 0.7, 0.5 * height - 0.4)
-    size = {"width": width, "height": height}
-    return Camera.from_pose(pose, focal=focal, centre=centre, **size, near=near, far=far)
+    options = {"width": width, "height": height, "near": near, "far": far}
+    return Camera.from_pose(camera_around(40, 25, distance), focal=focal, centre=centre, **options)
 
 
 def gaussians(count, *, seed=0, channels=3, size=0.15, spread=0.8):
@@ -166,8 +167,7 @@ def test_the_same_bits_on_any_number_of_threads(monkeypatch):
         tensors = (image.colour, image.opacity, image.depth, image.means2d.grad)
         found.append([*tensors, *(t.grad for t in given)])
     for first, *others in zip(*found, strict=True):
-        for other in others:
-            assert torch.equal(first, other)
+        assert all(torch.equal(first, other) for other in others)
 
 
 def in_front(camera, across=0.0, distance=0.0):
@@ -200,8 +200,7 @@ def test_points_needles_discs_and_giants(kind, scale):
         close(image.opacity, expected[1], most)
         close(image.colour, expected[0], most)
         back(image)
-        for leaf in leaves:
-            assert leaf.grad.isfinite().all()
+        assert all(leaf.grad.isfinite().all() for leaf in leaves)
 
 
 def test_thousands_of_layers_stop_at_the_cut_off(kind):
@@ -257,25 +256,26 @@ def test_what_is_not_seen_changes_nothing(kind, change):
 
 
 def test_no_gaussians_show_the_background(kind):
-    given = [t[:0] for t in single(camera_of())]
-    image, leaves = drawn(kind, given, camera_of(), background=torch.tensor([0.25, 0.5, 1.0]))
-    assert (image.colour == image.colour.new_tensor([0.25, 0.5, 1.0])).all()
+    given, background = [t[:0] for t in single(camera_of())], torch.tensor([0.25, 0.5, 1.0])
+    image, leaves = drawn(kind, given, camera_of(), background=background)
+    assert (image.colour == background.to(image.colour)).all()
     assert (image.opacity == 0).all()
     assert (image.depth == 0).all()
     image.colour.sum().backward()
     assert leaves[0].grad is None or leaves[0].grad.shape == (0, 3)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_numbers_that_are_not_finite_are_named(kind, name):
-    for bad in (float("nan"), float("inf")):
-        given = gaussians(5)
-        given[NAMES.index(name)][3] = bad
-        with pytest.raises(GaussianError, match=rf"^{name} of Gaussian 3 of 5 are .*finite"):
-            drawn(kind, given, camera_of())
-
-
-def test_shapes_and_values_that_cannot_be_are_named():
+def test_numbers_and_shapes_that_cannot_be_are_named():
+    for name, row, value, words in (
+        *((name, 3, math.nan, "of Gaussian 3 of 5 are .*finite") for name in NAMES),
+        *((name, 3, math.inf, "of Gaussian 3 of 5 are .*finite") for name in NAMES),
+        ("scales", 2, -0.1, "of Gaussian 2 are .*-0.1"),
+        ("opacities", 2, 1.1, "of Gaussian 2 are .*1.1"),
+    ):
+        given = dict(zip(NAMES, gaussians(5), strict=True))
+        given[name][row] = value
+        with pytest.raises(GaussianError, match=f"^{name} {words}"):
+            rasterise(*given.values(), camera_of())
     for position, name in enumerate(NAMES):
         given = gaussians(5)
         given[position] = given[position][:4] if position else given[position][:, :2]
@@ -283,21 +283,20 @@ def test_shapes_and_values_that_cannot_be_are_named():
             rasterise(*given, camera_of())
     with pytest.raises(GaussianError, match=r"^background is \[2\], but must be \[3\]"):
         rasterise(*gaussians(5), camera_of(), torch.ones(2))
-    for name, value in (("scales", -0.1), ("opacities", 1.1)):
-        given = gaussians(5)
-        given[NAMES.index(name)][2] = value
-        with pytest.raises(GaussianError, match=rf"^{name} of Gaussian 2 are .*{value}"):
-            rasterise(*given, camera_of())
 
 
-def test_cameras_that_cannot_be_are_refused():
-    for name, value in (("fx", 0.0), ("width", -1), ("near", 0.0), ("far", 0.001)):
-        with pytest.raises(ValueError, match=rf"^camera\.{name}={value}"):
-            dataclasses.replace(camera_of(), **{name: value})
-    with pytest.raises(ValueError, match=r"^camera\.world_to_camera is \[3, 4\]"):
-        dataclasses.replace(camera_of(), world_to_camera=torch.zeros(3, 4))
-    with pytest.raises(ValueError, match=r"^camera\.world_to_camera is not finite"):
-        dataclasses.replace(camera_of(), world_to_camera=torch.full((4, 4), float("nan")))
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        *((name, value, f"={value}") for name, value in
+          (("fx", 0.0), ("width", -1), ("near", 0.0), ("far", 0.001))),
+        ("world_to_camera", torch.zeros(3, 4), r" is \[3, 4\]"),
+        ("world_to_camera", torch.full((4, 4), math.nan), " is not finite"),
+    ],
+)  # fmt: skip
+def test_cameras_that_cannot_be_are_refused(name, value, words):
+    with pytest.raises(ValueError, match=rf"^camera\.{name}{words}"):
+        dataclasses.replace(camera_of(), **{name: value})
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -307,9 +306,12 @@ def test_spherical_harmonics_are_those_of_legendre(degree):
     coefficients = draw.standard_normal((6, 16, 3))
     found = spherical_harmonics(degree, torch.tensor(coefficients), torch.tensor(directions))
     pairs = [(d, order) for d in range(degree + 1) for order in range(-d, d + 1)]
-    for n in range(6):
-        basis = np.array([oracle.harmonic(*pair, directions[n]) for pair in pairs])
-        np.testing.assert_allclose(found[n], basis @ coefficients[n, : len(pairs)], atol=1e-12)
+    basis = np.array([[oracle.harmonic(*pair, to) for pair in pairs] for to in directions])
+    expected = np.einsum("nk,nkc->nc", basis, coefficients[:, : len(pairs)])
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    units = torch.nn.functional.normalize(torch.tensor(directions), dim=1)
+    inputs = networks.spherical_harmonics(units)[:, : len(pairs)]
+    np.testing.assert_allclose(inputs, basis, atol=1e-12)
 
 
 def test_cuda_says_what_brings_it(monkeypatch):

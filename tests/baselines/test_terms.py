@@ -2,14 +2,17 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from tests.balls import ball_scene
-from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX, baseline_config
+from tests.baselines import oracles
+from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX, baseline_config, under
+from tests.baselines.test_kplanes_field import products
 from xplanes.baselines.products import PlaneTerms
-from xplanes.baselines.proposal import histogram_loss
+from xplanes.baselines.proposal import UpdateSchedule, histogram_loss
 from xplanes.baselines.tensor4d.model import eikonal_error, masked_colour_error, silhouette_error
 from xplanes.baselines.tineuvox.model import light_entropy, sample_colour_error
 from xplanes.models.base import warm_cosine
@@ -47,35 +50,56 @@ def error_of(rendering, rays):
     return (rendering.colour - rays["target"]).square().mean()
 
 
-def check_planes(products, weights, add):
+TERMS = ("total_variation", "time_smoothness", "time_identity")
+
+
+def check_planes(products, weights, add, variation="coded"):
     """What ``add`` leaves in the gradients is autograd's of the weighted terms."""
-    values = PlaneTerms(1.0, "coded", 1.0, 1.0).values(products)
-    names = ("total_variation", "time_smoothness", "time_identity")
+    values = PlaneTerms(1.0, variation, 1.0, 1.0).values(products)
     planes = [plane for _, plane in products.planes()]
-    total = sum(weight * values[name] for weight, name in zip(weights, names, strict=True))
+    total = sum(weight * values[name] for weight, name in zip(weights, TERMS, strict=True))
     expected = torch.autograd.grad(total, planes)
     add()
+    tolerance = {} if planes[0].dtype == torch.float64 else {"atol": 1e-7, "rtol": 1e-4}
     for plane, wanted in zip(planes, expected, strict=True):
         assert wanted.abs().sum() > 0
-        torch.testing.assert_close(plane.grad, wanted, atol=1e-7, rtol=1e-4)
+        torch.testing.assert_close(plane.grad, wanted, **tolerance)
+
+
+@pytest.mark.parametrize("time", [4, None])
+@pytest.mark.parametrize("variation", ["coded", "corrected"])
+def test_terms_of_planes_and_their_gradients_are_those_of_the_formulas(variation, time):
+    planes = products(time).double()
+    arrays = [(name, plane.detach()[0].numpy()) for name, plane in planes.planes()]
+    total_variation = getattr(oracles, f"{variation}_variation")
+    values = PlaneTerms(1.0, variation, 1.0, 1.0).values(planes)
+    for name, oracle in zip(
+        TERMS, (total_variation, oracles.bend, oracles.distance_from_one), strict=True
+    ):
+        expected = pytest.approx(oracle(arrays), rel=1e-9)
+        assert float(values[name].detach()) == expected, name
+    weights = 0.3, 0.7, 0.2
+    terms = PlaneTerms(weights[0], variation, *weights[1:])
+    check_planes(planes, weights, lambda: terms.add_gradients(planes), variation)
+
+
+@pytest.mark.parametrize(("every", "warmup", "steps"), [(5, 5000, 9000), (3, 50, 200), (1, 1, 40)])
+def test_density_fields_learn_at_the_published_steps(every, warmup, steps):
+    schedule = UpdateSchedule(every, warmup)
+    expected = oracles.learning_steps(every, warmup, steps)
+    assert [step for step in range(steps) if schedule.learns(step)] == expected
+    # A resumed run asks in the middle, and an earlier step may follow.
+    fresh = UpdateSchedule(every, warmup)
+    assert fresh.learns(expected[-1])
+    assert fresh.learns(expected[3])
 
 
 def test_kplanes_regularises_its_planes_and_those_of_the_density_fields(tmp_path):
     module, _ = module_of(
         tmp_path,
-        "model=kplanes",
-        *KPLANES,
-        *PROPOSAL,
-        *(
-            "model.loss.total_variation=0.3",
-            "model.loss.time_smoothness=0.7",
-            "model.loss.time_identity=0.2",
-        ),
-        *(
-            "model.sampler.total_variation=0.5",
-            "model.sampler.time_smoothness=0.1",
-            "model.sampler.time_identity=0.4",
-        ),
+        *("model=kplanes", *KPLANES, *PROPOSAL),
+        *under("model.loss", total_variation=0.3, time_smoothness=0.7, time_identity=0.2),
+        *under("model.sampler", total_variation=0.5, time_smoothness=0.1, time_identity=0.4),
     )
     with torch.no_grad():
         for parameter in module.parameters():
@@ -104,9 +128,7 @@ def test_density_fields_learn_by_the_weighted_histogram_term(tmp_path):
     (total,) = module.model.losses(rendering, rays, FIRST).values()
     assert total.item() == pytest.approx(error_of(rendering, rays).item(), rel=1e-6)
     late = next(s for s in range(6000, 6006) if not module.sampler.schedule.learns(s))
-    undisturbed = module.sampler.render(
-        module.field, rays, TrainingState(seed=0, step=late, batch=0, rank=0)
-    )
+    undisturbed = module.sampler.render(module.field, rays, replace(FIRST, step=late))
     assert module.sampler.losses(undisturbed) == {}
 
 
@@ -118,14 +140,14 @@ def test_annealing_rises_as_published_and_stays_for_images(tmp_path):
         share = min(step / 1000, 1)
         expected = 10 * share / (9 * share + 1)
         assert sampler.anneal(step) == pytest.approx(expected)
-        sampler.render(module.field, rays, TrainingState(seed=0, step=step, batch=0, rank=0))
+        sampler.render(module.field, rays, replace(FIRST, step=step))
         assert float(sampler.renderer.exponent) == pytest.approx(expected)
     # With an exponent of 0 all bins weigh the same, whatever the density fields hold.
     sampler.render(module.field, rays, FIRST)
     keys = ("origins", "directions", "times", "background")
     flat = sampler.renderer.render(module.field, *(rays[key] for key in keys))
-    gaps = [level.edges.diff(dim=1) for level in flat.levels]
-    for gap in gaps:
+    for level in flat.levels:
+        gap = level.edges.diff(dim=1)
         torch.testing.assert_close(gap, gap.mean().expand_as(gap), atol=1e-5, rtol=1e-4)
     assert "proposals.exponent" in module.state_dict()
 
@@ -149,13 +171,8 @@ def test_tineuvox_adds_up_colours_decided_rays_and_single_samples(tmp_path):
     for entropy, spread in ((0.0, 0.0), (0.3, 0.0), (0.0, 0.7), (0.001, 0.01)):
         module, rays = module_of(
             tmp_path,
-            "model=tineuvox_s",
-            *TINEUVOX,
-            *(
-                f"model.loss.entropy={entropy}",
-                f"model.loss.sample_colour={spread}",
-                "model.sampler.threshold=1e-30",
-            ),
+            *("model=tineuvox_s", *TINEUVOX, "model.sampler.threshold=1e-30"),
+            *under("model.loss", entropy=entropy, sample_colour=spread),
         )
         seen = module.sampler.render(module.field, rays, FIRST)
         losses = module.model.losses(seen, rays, FIRST)
@@ -169,25 +186,14 @@ def test_tineuvox_adds_up_colours_decided_rays_and_single_samples(tmp_path):
 
 
 def test_tensor4d_adds_up_its_terms(tmp_path, monkeypatch):
-    for weights in [
-        (0, 0, 0, True),
-        (0.2, 0, 0, True),
-        (0, 0.3, 0, True),
-        (0, 0, 5, True),
-        (0, 0, 0, False),
-    ]:
+    distance = 0.02
+    for weights in [(0.2, 0, 0, True), (0, 0.3, 0, True), (0, 0, 5, True), (0, 0, 0, False)]:
         eikonal, opacity, smoothness, masked = weights
-        distance = 0.02
         module, rays = module_of(
             tmp_path,
-            "model=tensor4d",
-            *TENSOR4D,
-            *NEUS,
-            f"model.loss.eikonal={eikonal}",
-            f"model.loss.opacity={opacity}",
-            f"model.loss.smoothness={smoothness}",
-            f"model.loss.smoothness_distance={distance}",
-            f"model.loss.masked={str(masked).lower()}",
+            *("model=tensor4d", *TENSOR4D, *NEUS),
+            *under("model.loss", eikonal=eikonal, opacity=opacity, masked=str(masked).lower()),
+            *under("model.loss", smoothness=smoothness, smoothness_distance=distance),
         )
         # Features that change by 3 per unit of length, whichever way.
         monkeypatch.setattr(module.field, "features", lambda places: 3 * places)

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from tests.synthetic.rays import float_rays
 from xplanes.synthetic.demo import Assembly, Joint, Part
 from xplanes.synthetic.demo.geometry import Box, Checker, Ellipsoid, Plain
 from xplanes.synthetic.demo.implicit import Bent, Blend, Drop, Fluid, Lobed, Twisted, Waving
@@ -33,16 +34,9 @@ SHAPES = {
 TIMES = (0.0, 0.24, 0.7)
 
 
-def rays_at(count):
-    torch.manual_seed(1)
-    origins = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1) * 3
-    directions = 0.6 * (2 * torch.rand(count, 3) - 1) - origins
-    return origins, torch.nn.functional.normalize(directions, dim=-1)
-
-
 @pytest.mark.parametrize("name", SHAPES)
 def test_rays_meet_the_surface_where_a_dense_search_finds_it(name):
-    origins, directions = rays_at(600)
+    origins, directions = float_rays(600, seed=1, distance=3.0, spread=0.6)
     steps = torch.linspace(1.6, 4.4, 3000)
     for time in TIMES:
         shape = SHAPES[name].at(time)
@@ -151,9 +145,7 @@ def test_a_scale_joint_scales_all_that_it_carries():
     images = (render_image(plain, near, 48), render_image(scaled, far, 48))
     difference = images[0].astype(int) - images[1].astype(int)
     assert (abs(difference).max(axis=-1) > 2).mean() < 0.005
-
-
-def test_a_placed_assembly_may_be_scaled():
+    # All of a placed assembly may be scaled.
     whole = Assembly((Part(Box((0.3, 0.2, 0.1)), Plain((1.0, 0.0, 0.0))),))
     low, high = whole.placed((1.0, 0.0, 0.0), scale=3.0).pose(0).bounds()
     assert torch.allclose(low, torch.tensor([0.1, -0.6, -0.3]))

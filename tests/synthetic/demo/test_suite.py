@@ -12,8 +12,9 @@ import yaml
 from PIL import Image
 
 from tests.refusals import assert_refused
+from tests.training.runs import changed
 from xplanes.components import build
-from xplanes.config import CONF, compose_plain
+from xplanes.config import CONF
 from xplanes.errors import SceneError
 from xplanes.scenes.source import SceneSettings
 from xplanes.synthetic.demo.assembly import Assembly, Part
@@ -28,13 +29,6 @@ from xplanes.synthetic.demo.write import MASKS, ensure_suite_scene
 
 SIDE = 24
 COUNTS = {"train": 50, "val": 10, "test": 12}
-
-SCENES = [
-    pytest.param(name, marks=[pytest.mark.slow] * name.endswith("_test")) for name in SUITE_SCENES
-]
-"""Those to tune on in every run of the tests; their twins in that of the wings."""
-
-SOME = ("deformation", "phone", "rig", "topology")
 
 
 @functools.cache
@@ -72,9 +66,7 @@ def times(name, split="train"):
     return [time for time, _ in capture_of(name).shots[split]]
 
 
-@pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind not in SOME)) for kind in KINDS]
-)
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_scene_to_tune_on_and_another_to_test_on(kind):
     tuning, test = both(kind)
     assert test in SUITE_SCENES
@@ -85,8 +77,12 @@ def test_a_scene_to_tune_on_and_another_to_test_on(kind):
     assert len(shapes[0] & shapes[1]) < 0.2 * min(map(len, shapes))
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_every_view_shows_the_scene_within_the_picture(name):
+@pytest.mark.parametrize("name", SUITE_SCENES)
+def test_every_view_shows_the_scene_within_the_picture_and_things_move(name):
+    camera = cameras(name)[5]
+    first, later = (picture(name, time, camera).astype(int) for time in (0.0, 0.37))
+    moved = (np.abs(first - later) > 25).any(axis=-1).sum()
+    assert moved == 0 if name.startswith("static") else moved >= 4
     alpha = pictures(name)[..., 3]
     assert ((alpha > 127).mean(axis=(1, 2)) > 0.015).all()
     if "white_floor" not in name:
@@ -94,7 +90,7 @@ def test_every_view_shows_the_scene_within_the_picture(name):
         assert (border > 127).mean() < 0.05
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", SUITE_SCENES)
 def test_times_and_cameras_of_the_splits(name):
     last = SUITE_SCENES[name].rig.end
     expected = np.linspace(0, last, 50)
@@ -112,15 +108,6 @@ def test_times_and_cameras_of_the_splits(name):
             assert all(a < b < last for a, b in pairwise(held_out))
         distances = torch.cdist(cameras(name, split)[:, :3, 3], cameras(name)[:, :3, 3])
         assert distances.min() > 1e-3 * SUITE_SCENES[name].rig.distance
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_things_move_unless_the_scene_is_static(name):
-    camera = cameras(name)[5]
-    first, later = (picture(name, time, camera).astype(int) for time in (0.0, 0.37))
-    moved = (np.abs(first - later) > 25).any(axis=-1).sum()
-    assert moved == 0 if name.startswith("static") else moved >= 4
-    assert len(set(times(name))) == (7 if name in both("rig") else 50)
 
 
 @pytest.mark.parametrize("name", both("fast_motion"))
@@ -171,12 +158,16 @@ def test_things_grow_and_shrink(name):
     assert (ratio > 1.3).sum() >= 8
 
 
-@pytest.mark.parametrize("name", both("fixed_cameras"))
-def test_six_cameras_take_turns(name):
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [*((name, 6) for name in both("fixed_cameras")), *((name, 8) for name in both("rig"))],
+)
+def test_fixed_cameras_take_turns_and_a_rig_takes_eight_pictures_at_once(name, count):
     poses = cameras(name)
-    assert len(poses.unique(dim=0)) == 6
-    assert torch.equal(poses[:44], poses[6:])
-    assert len(cameras(name, "test").unique(dim=0)) == 12
+    assert len(poses.unique(dim=0)) == len(poses[:count].unique(dim=0)) == count
+    assert torch.equal(poses[:-count], poses[count:])
+    if count == 6:
+        assert len(cameras(name, "test").unique(dim=0)) == 12
 
 
 @pytest.mark.parametrize("name", both("phone"))
@@ -196,23 +187,18 @@ def test_a_phone_is_carried_along_an_arc(name):
         assert abs(times(name)[int(distance.argmin())] - time) > 0.04, pose
 
 
-@pytest.mark.parametrize("name", both("rig"))
-def test_a_rig_takes_eight_pictures_at_once(name):
-    poses = cameras(name)
-    assert len(poses[:8].unique(dim=0)) == 8
-    assert torch.equal(poses[:42], poses[8:])
+def suite_data(root, name, *overrides, side=SIDE, views=(3, 1, 2)):
+    """Settings of a small capture."""
+    counts = (f"data.{s}_views={n}" for s, n in zip(("train", "val", "test"), views, strict=True))
+    small = ("data=suite", f"data.root={root}", f"data.resolution={side}", *counts)
+    plain = changed((), *small, f"data.scene={name}", *overrides)
+    return build(plain["data"], SceneSettings, "data")
 
 
-LATER = [pytest.param(name, marks=pytest.mark.slow) for name in ("phone_test", "rig_test")]
-
-
-@pytest.mark.parametrize("name", ["phone", "rig", *LATER])
+@pytest.mark.parametrize("name", [*both("phone"), *both("rig")])
 def test_captures_have_a_world_behind_and_masks_of_the_thing(name, tmp_path):
-    counts = {"train_views": 3, "val_views": 1, "test_views": 2}
-    folder = ensure_suite_scene(tmp_path, name, resolution=SIDE, **counts, announce=lambda _: None)
-    data = ("data=suite", f"data.scene={name}", f"data.resolution={SIDE}", f"data.root={tmp_path}",
-            *(f"data.{key}={value}" for key, value in counts.items()))  # fmt: skip
-    scene = build(compose_plain("train", data)["data"], SceneSettings, "data").read()
+    data = suite_data(tmp_path, name)
+    scene, folder = data.read(), data.folder
     assert scene.splits["train"].is_opaque
     assert set(scene.splits) == {"train", "val", "test"}
     shots = SUITE_SCENES[name].rig.capture({"train": 3}, f"{name} 0").shots["train"]
@@ -228,14 +214,9 @@ def test_captures_have_a_world_behind_and_masks_of_the_thing(name, tmp_path):
         assert 0.03 < (mask > 127).mean() < 0.5
 
 
-@pytest.mark.slow
 def test_masks_of_a_thing_cut_it_out_where_that_is_asked_for(tmp_path):
-    folder = ("data=suite", f"data.root={tmp_path}", f"data.resolution={SIDE}",
-              "data.train_views=2", "data.val_views=1", "data.test_views=1")  # fmt: skip
-
     def scene(name, use):
-        given = compose_plain("train", [*folder, f"data.scene={name}", f"data.mask_use={use}"])
-        return build(given["data"], SceneSettings, "data").read()
+        return suite_data(tmp_path, name, f"data.mask_use={use}", views=(2, 1, 1)).read()
 
     whole, alpha, lrm = (scene("phone", use) for use in ("score", "alpha", "lrm"))
     masks = whole.splits["train"].foreground
@@ -252,53 +233,35 @@ def test_masks_of_a_thing_cut_it_out_where_that_is_asked_for(tmp_path):
     assert_refused(SceneError, words, lambda: scene("dark", "alpha"), "dark")
 
 
-def test_layers_are_composited_from_front_to_back():
-    """Through a ball of jelly in a box of glass, against the formula."""
-    jelly = Translucent(Plain((0.0, 1.0, 0.0)), density=2.0)
-    glass = Translucent(Plain((1.0, 0.0, 0.0)), shell=0.3)
-    parts = (Part(ball(0.5), jelly), Part(Box((1.0, 1.0, 1.0)), glass))
-    origins, directions = torch.tensor([[0.0, 0.0, 4.0]]), torch.tensor([[0.0, 0.0, -1.0]])
-    ray = Assembly(parts, light=None).pose(0).render(origins, directions)[0]
+def test_layers_are_composited_from_front_to_back_until_something_is_opaque():
+    """Through a ball in a box of glass, against the formula."""
     filling = 1 - math.exp(-2.0)
+    jelly = Translucent(Plain((0.0, 1.0, 0.0)), density=2.0)
     red, green = 0.3 + 0.7 * (1 - filling) * 0.3, 0.7 * filling
-    expected = torch.tensor([red, green, 0.0, 1 - 0.49 * (1 - filling)])
-    assert torch.allclose(ray, expected, atol=1e-3)
-
-
-def test_an_opaque_thing_ends_the_ray_and_unlit_paint_keeps_its_colour():
-    glass = Translucent(Plain((1.0, 0.0, 0.0)), shell=0.3)
-    parts = (Part(ball(0.5), Unlit(Plain((0.0, 0.6, 0.0)))), Part(Box((1.0, 1.0, 1.0)), glass))
-    origins, directions = torch.tensor([[0.0, 0.0, 4.0]]), torch.tensor([[0.0, 0.0, -1.0]])
-    posed = Assembly(parts, light=Light(ambient=1.0, sun=0.0, sky=0.0)).pose(0)
-    ray = posed.render(origins, directions)[0]
-    assert torch.allclose(ray, torch.tensor([0.3, 0.7 * 0.6, 0.0, 1.0]), atol=1e-4)
+    unlit, light = Unlit(Plain((0.0, 0.6, 0.0))), Light(ambient=1.0, sun=0.0, sky=0.0)
+    glass = Part(Box((1.0, 1.0, 1.0)), Translucent(Plain((1.0, 0.0, 0.0)), shell=0.3))
+    for pattern, lit, expected, most in (
+        (jelly, None, (red, green, 0.0, 1 - 0.49 * (1 - filling)), 1e-3),
+        (unlit, light, (0.3, 0.7 * 0.6, 0.0, 1.0), 1e-4),
+    ):
+        posed = Assembly((Part(ball(0.5), pattern), glass), light=lit).pose(0)
+        ray = posed.render(torch.tensor([[0.0, 0.0, 4.0]]), torch.tensor([[0.0, 0.0, -1.0]]))[0]
+        assert torch.allclose(ray, torch.tensor(expected), atol=most), pattern
 
 
 def test_a_folder_in_the_layout_of_d_nerf(tmp_path):
-    settings = ("data=suite", "data.scene=dark", "data.resolution=8", f"data.root={tmp_path}",
-                "data.train_views=3", "data.test_views=2", "data.val_views=1")  # fmt: skip
-    data = build(compose_plain("train", settings)["data"], SceneSettings, "data")
+    data = suite_data(tmp_path, "dark", side=8)
     scene = data.read(("train", "val", "test"))
-    assert {split: len(views) for split, views in scene.splits.items()} == {
-        "train": 3,
-        "val": 1,
-        "test": 2,
-    }
+    counts = {split: len(views) for split, views in scene.splits.items()}
+    assert counts == {"train": 3, "val": 1, "test": 2}
     assert scene.video is None
     assert data.folder.name == "dark_8px_s0_3-1-2"
     index = json.loads((data.folder / "transforms_test.json").read_text())
     assert index["camera_angle_x"] == SUITE_SCENES["dark"].rig.angle_x
     with Image.open(data.folder / (index["frames"][1]["file_path"] + ".png")) as image:
         assert image.mode == "RGBA"
-    again = ensure_suite_scene(
-        tmp_path,
-        "dark",
-        resolution=8,
-        train_views=3,
-        test_views=2,
-        val_views=1,
-        announce=pytest.fail,
-    )
+    asked = {f"{split}_views": count for split, count in counts.items()}
+    again = ensure_suite_scene(tmp_path, "dark", resolution=8, **asked, announce=pytest.fail)
     assert again == data.folder
 
 

@@ -13,11 +13,7 @@ from PIL import Image
 from xplanes.synthetic.demo import ensure_demo_scene, write
 from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE
 
-ASKED = {"resolution": 16, "train_views": 4, "val_views": 2, "test_views": 3}
-
-
-USUAL_FRAMES = write.VIDEO_FRAMES
-FRAMES = 5
+USUAL_FRAMES, FRAMES = write.VIDEO_FRAMES, 5
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -27,12 +23,9 @@ def short_videos():
         yield
 
 
-def quiet(_: str) -> None:
-    pass
-
-
 def make(root: Path, name: str = "balls", **changes) -> Path:
-    return ensure_demo_scene(root, name, **{**ASKED, "announce": quiet, **changes})
+    asked = {"resolution": 16, "train_views": 4, "val_views": 2, "test_views": 3}
+    return ensure_demo_scene(root, name, **asked | {"announce": lambda _: None} | changes)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -106,23 +99,23 @@ def test_the_same_request_gives_the_same_bytes(folder, tmp_path):
 def test_a_finished_folder_is_reused_and_a_damaged_one_rebuilt(folder, tmp_path):
     copy = tmp_path / folder.name
     shutil.copytree(folder, copy)
+    record = json.loads((copy / "demo.json").read_text())
     said: list[str] = []
     assert make(tmp_path, announce=said.append) == copy
     assert said == []
-    expected = contents(folder)
-    (copy / "test" / "r_001.png").unlink()
-    assert make(tmp_path, announce=said.append) == copy
-    assert len(said) == 1
-    assert "balls" in said[0]
-    assert contents(copy) == expected
-    (copy / "demo.json").unlink()
-    make(tmp_path, announce=said.append)
-    assert len(said) == 2
-    record = json.loads((copy / "demo.json").read_text())
-    (copy / "demo.json").write_text(json.dumps({**record, "version": -1}))
-    make(tmp_path, announce=said.append)
-    assert len(said) == 3
-    assert contents(copy) == expected
+    for number, damage in enumerate(
+        (
+            (copy / "test" / "r_001.png").unlink,
+            (copy / "demo.json").unlink,
+            lambda: (copy / "demo.json").write_text(json.dumps({**record, "version": -1})),
+        ),
+        start=1,
+    ):
+        damage()
+        assert make(tmp_path, announce=said.append) == copy
+        assert len(said) == number
+        assert "balls" in said[-1]
+        assert contents(copy) == contents(folder)
     assert [path.name for path in tmp_path.iterdir()] == [folder.name]
 
 
@@ -159,5 +152,5 @@ def test_usual_counts_give_the_short_name_and_bad_requests_are_refused(tmp_path,
 
 
 def test_the_wait_is_printed_by_default(tmp_path, capsys):
-    ensure_demo_scene(tmp_path, "balls", **{**ASKED, "resolution": 4})
+    make(tmp_path, resolution=4, announce=None)
     assert "balls" in capsys.readouterr().out

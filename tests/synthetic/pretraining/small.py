@@ -3,36 +3,21 @@
 import copy
 import functools
 
+import numpy as np
 import torch
 
+from tests.baselines.runs import under
 from xplanes.lrm.config import parse_config
 from xplanes.synthetic.pretraining.pool import FOCAL, Pool, draw_sample
 from xplanes.synthetic.pretraining.run import compose_pretraining
 from xplanes.synthetic.pretraining.settings import parse_pretraining, published_sizes
 
 OVERRIDES = (
-    "model.image_size=24",
-    "model.patch=8",
-    "model.encoder_depth=1",
-    "model.width=48",
-    "model.heads=2",
-    "model.layers=2",
-    "model.low_resolution=4",
-    "model.channels=8",
-    "model.camera_width=8",
-    "batch.objects=3",
-    "batch.near=64",
-    "batch.volume=32",
-    "batch.free=32",
-    "batch.colour=32",
-    "batch.rays=8",
-    "batch.samples=8",
-    "pool.objects=256",
-    "pool.views=2",
-    "schedule.max_seconds=null",
-    "schedule.warmup_steps=2",
-    "schedule.render_from=0.5",
-    "schedule.score_objects=2",
+    *under("model", image_size=24, patch=8, encoder_depth=1, width=48, heads=2, layers=2),
+    *under("model", low_resolution=4, channels=8, camera_width=8),
+    *under("batch", objects=3, near=64, volume=32, free=32, colour=32, rays=8, samples=8),
+    *under("pool", objects=256, views=2),
+    *under("schedule", max_seconds="null", warmup_steps=2, render_from=0.5, score_objects=2),
 )
 SIDE = 24
 
@@ -56,8 +41,6 @@ def small_sizes(*overrides):
 
 
 def small_pool(count=6):
-    import numpy as np
-
     return Pool((np.concatenate([draw_sample(seed, 2, SIDE) for seed in range(count)]),))
 
 

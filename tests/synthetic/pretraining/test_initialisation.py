@@ -56,17 +56,14 @@ def test_finer_planes_are_initialised_from_coarser_ones():
     torch.manual_seed(0)
     earlier = init_model(small_sizes(), 0)
     finer = small_sizes("model.low_resolution=8")
-    untouched = grow_model(earlier, finer).state_dict()
-    assert same(
-        {k: v for k, v in untouched.items() if k != "position"},
-        {k: v for k, v in earlier.state_dict().items() if k != "position"},
-    )
-    torch.testing.assert_close(untouched["position"], init_model(finer, 0).position.data)
+    grown, before = grow_model(earlier, finer).state_dict(), earlier.state_dict()
+    position = grown.pop("position")
+    before.pop("position")
+    assert same(grown, before)
+    torch.testing.assert_close(position, init_model(finer, 0).position.data)
     with torch.no_grad():
         earlier.position += 0.3
-    torch.testing.assert_close(
-        grow_model(earlier, finer).position.data, untouched["position"] + 0.3
-    )
+    torch.testing.assert_close(grow_model(earlier, finer).position.data, position + 0.3)
 
 
 def test_exported_weights_are_loaded_unchanged(tmp_path):
@@ -80,7 +77,11 @@ def test_exported_weights_are_loaded_unchanged(tmp_path):
     assert loaded.decoder.density_scale == SIZES["density_scale"]
     for name, tensor in model.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], tensor.half().float())
-    assert set(published_state(model)) == set(published_state(loaded))  # type: ignore[arg-type]
+    state = published_state(model)
+    assert set(state) == set(published_state(loaded))  # type: ignore[arg-type]
+    # Queries and keys are equally wide.
+    assert "transformer.layers.0.cross_attn.in_proj_weight" in state
+    assert not [name for name in state if "q_proj" in name]
     images = torch.rand(2, 3, 24, 24)
     planes = loaded.encode(images)
     assert planes.shape == (2, 3, 8, 8, 8)
@@ -90,51 +91,38 @@ def test_exported_weights_are_loaded_unchanged(tmp_path):
     assert load(SIZES, path).config == loaded.config
 
 
-def test_published_names_of_equally_wide_queries_and_keys():
-    state = published_state(init_model(small_sizes(), 0))
-    assert "transformer.layers.0.cross_attn.in_proj_weight" in state
-    assert not [name for name in state if "q_proj" in name]
-
-
 def test_the_camera_and_scale_have_the_published_defaults():
     for key, default in (("source_distance", 2.0), ("source_focal", 0.75), ("density_scale", 1.0)):
         plain = {k: v for k, v in SIZES.items() if k != key}
         assert getattr(parse_config(plain), key) == default, key
         for wrong in (0, -1.0, float("inf"), "far"):
-            sizes = {**SIZES, key: wrong}
-            call = partial(parse_config, sizes)
+            call = partial(parse_config, {**SIZES, key: wrong})
             assert_refused(LRMError, key, call, f"{key}={wrong}")
-
-
-def test_encoder_sizes_go_by_either_name():
-    sizes = {k: v for k, v in SIZES.items() if k != "encoder_sizes"}
-    assert parse_config({**sizes, "_reduced_encoder": SIZES["encoder_sizes"]}) == parse_config(
-        SIZES
-    )
+    # Sizes of the encoder go by either name.
+    sizes = dict(SIZES)
+    sizes["_reduced_encoder"] = sizes.pop("encoder_sizes")
+    assert parse_config(sizes) == parse_config(SIZES)
 
 
 def test_settings_that_cannot_work_are_refused_by_name():
-    for section, key, value, message in (
-        ("model", "patch", 7, r"model\.image_size=24.*model\.patch=7"),
-        ("model", "heads", 5, r"model\.width=48"),
-        ("model", "heads", 24, r"model\.width=48: must be at least 288"),
-        ("pool", "views", 1, r"pool\.views=1"),
-        ("batch", "objects", 0, r"batch\.objects=0"),
-        ("batch", "objects", 10**6, r"batch\.objects=1000000.*pool\.objects"),
-        ("batch", "colour", 0, r"batch\.colour=0"),
-        ("batch", "samples", 2, r"batch\.samples=2"),
-        ("schedule", "max_steps", 0, r"schedule\.max_steps=0"),
-        ("schedule", "clip", -1.0, r"schedule\.clip=-1"),
-        ("schedule", "decay_share", 1.5, r"schedule\.decay_share=1\.5"),
+    for section, change, message in (
+        ("model", {"patch": 7}, r"model\.image_size=24.*model\.patch=7"),
+        ("model", {"heads": 5}, r"model\.width=48"),
+        ("model", {"heads": 24}, r"model\.width=48: must be at least 288"),
+        ("pool", {"views": 1}, r"pool\.views=1"),
+        ("batch", {"objects": 0}, r"batch\.objects=0"),
+        ("batch", {"objects": 10**6}, r"batch\.objects=1000000.*pool\.objects"),
+        ("batch", {"colour": 0}, r"batch\.colour=0"),
+        ("batch", {"samples": 2}, r"batch\.samples=2"),
+        ("batch", {"near": 0, "volume": 0, "free": 0}, r"batch\.near=0"),
+        ("schedule", {"max_steps": 0}, r"schedule\.max_steps=0"),
+        ("schedule", {"clip": -1.0}, r"schedule\.clip=-1"),
+        ("schedule", {"decay_share": 1.5}, r"schedule\.decay_share=1\.5"),
     ):
         plain = small_plain()
-        plain[section][key] = value
-        assert_refused(ConfigError, message, partial(parse_pretraining, plain), key)
-    plain = small_plain()
-    plain["batch"] |= dict.fromkeys(("near", "volume", "free"), 0)
-    assert_refused(ConfigError, r"batch\.near=0", partial(parse_pretraining, plain), "points")
+        plain[section] |= change
+        assert_refused(ConfigError, message, partial(parse_pretraining, plain), change)
     for override, message in (
-        ("schedule.clip=-1", r"schedule\.clip=-1"),
         ("batch.object=3", "batch.object"),
         ("pretrain=huge", "huge"),
         ("seed=some", "seed"),

@@ -29,31 +29,21 @@ def test_points_are_read_as_the_field_reads_them():
         torch.testing.assert_close(logits[i], decoder.logits(features.flatten(1)))
 
 
-def test_occupancy_is_the_opacity_of_one_step():
+def test_losses_are_of_the_opacity_of_one_step_and_of_colours_that_reach_beyond_their_range():
     logits, inside = 3 * randn(2, 50, 4), (randn(2, 50, seed=1) > 0).float()
-    density = torch.nn.functional.softplus(logits[..., 0] - 1)
-    alpha = 1 - torch.exp(-density)
+    alpha = 1 - torch.exp(-torch.nn.functional.softplus(logits[..., 0] - 1))
     wanted = torch.nn.functional.binary_cross_entropy(alpha, inside)
     torch.testing.assert_close(occupancy_loss(logits, inside), wanted)
-
-
-def test_colours_reach_a_little_beyond_their_range():
-    decoder = Decoder(2)
-    logits, colours = randn(3, 9, 4), randn(3, 9, 3, seed=1).sigmoid()
-    predicted = decoder.activate(logits.flatten(0, 1))[0].unflatten(0, (3, 9))
+    decoder, colours = Decoder(2), randn(2, 50, 3, seed=1).sigmoid()
+    predicted = decoder.activate(logits.flatten(0, 1))[0].unflatten(0, (2, 50))
     wanted = (predicted - colours).abs().mean()
     torch.testing.assert_close(colour_loss(logits, colours, decoder.colour_margin), wanted)
 
 
-def rays():
-    origins = torch.tensor([[[0.0, -3, 0], [0.2, -3, 0.1], [5.0, -3, 0], [0, -3, 0.9]]])
-    directions = torch.tensor([[[0.0, 1, 0], [0, 1, 0], [0, 1, 0], [0, 1, 0]]])
-    hits = torch.tensor([[2.5, torch.inf, torch.inf, 3.95]])
-    return origins, directions, hits
-
-
 def test_samples_fill_the_box_and_crowd_around_the_hit():
-    origins, directions, hits = rays()
+    origins = torch.tensor([[[0.0, -3, 0], [0.2, -3, 0.1], [5.0, -3, 0], [0, -3, 0.9]]])
+    directions = torch.tensor([0.0, 1, 0]).expand(1, 4, 3)
+    hits = torch.tensor([[2.5, torch.inf, torch.inf, 3.95]])
     for samples in (8, 9, 32):
         jitter = torch.rand(1, 4, samples, generator=torch.Generator().manual_seed(0))
         distances, lengths = ray_samples(origins, directions, hits, half_side=1.0, jitter=jitter)

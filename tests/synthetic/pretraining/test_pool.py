@@ -1,12 +1,13 @@
 """Records of objects on disk, and batches drawn from them."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 import torch
 
-from tests.synthetic.pretraining.small import SIDE, small_pool
+from tests.synthetic.pretraining.small import SIDE, same, small_pool
 from xplanes.errors import ConfigError
 from xplanes.lrm.canonical import OPENLRM_VIEW, CanonicalView
 from xplanes.streams import step_generator
@@ -29,12 +30,8 @@ def short_shards(monkeypatch):
     monkeypatch.setattr(pool_module, "SHARD", 2)
 
 
-def silent(_):
-    pass
-
-
 def drawn(folder, count=6, **other):
-    kind = {"views": 2, "side": 16, "announce": silent, **other}
+    kind = {"views": 2, "side": 16, "announce": lambda _: None, **other}
     return ensure_pool(folder, TRAINING_SEEDS[:count], **kind)
 
 
@@ -42,14 +39,26 @@ def content(pool):
     return [pool[i].tobytes() for i in range(len(pool))]
 
 
-def test_records_depend_on_their_seed_only(short_shards, tmp_path):
-    pool = drawn(tmp_path)
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The folder of a pool of three shards. Copy it before changing anything in it."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pool_module, "SHARD", 2)
+        drawn(folder)
+    return folder
+
+
+def test_records_depend_on_their_seed_only(short_shards, whole):
+    pool = drawn(whole)
     assert len(pool) == 6
     assert content(pool)[3] == draw_sample(3, 2, 16)[0].tobytes()
+    assert set(json.loads((whole / "pool.json").read_text())["sha256"]) == {
+        *("00000.npy", "00001.npy", "00002.npy"),
+    }
 
 
-def test_an_interrupted_pool_is_resumed(short_shards, tmp_path, monkeypatch):
-    whole = content(drawn(tmp_path / "whole"))
+def test_an_interrupted_pool_is_resumed(short_shards, whole, tmp_path, monkeypatch):
     calls, real = [], pool_module.draw_sample
 
     def stops(seed, views, side):
@@ -60,34 +69,29 @@ def test_an_interrupted_pool_is_resumed(short_shards, tmp_path, monkeypatch):
 
     monkeypatch.setattr(pool_module, "draw_sample", stops)
     with pytest.raises(KeyboardInterrupt):
-        drawn(tmp_path / "cut")
-    assert content(drawn(tmp_path / "cut")) == whole
+        drawn(tmp_path)
+    assert content(drawn(tmp_path)) == content(drawn(whole))
     assert calls[4:] == [2, 3, 4, 5]
     calls.clear()
-    drawn(tmp_path / "cut")
+    drawn(tmp_path)
     assert not calls
 
 
-def test_a_damaged_shard_is_generated_again(short_shards, tmp_path):
-    whole = content(drawn(tmp_path))
+def test_a_damaged_shard_is_generated_again(short_shards, whole, tmp_path):
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
     path = tmp_path / "00001.npy"
     damaged = bytearray(path.read_bytes())
     damaged[-7] ^= 1
     path.write_bytes(damaged)
-    assert content(drawn(tmp_path)) == whole
+    assert content(drawn(tmp_path)) == content(drawn(whole))
 
 
-def test_a_pool_of_another_kind_is_refused(short_shards, tmp_path):
-    drawn(tmp_path)
-    with pytest.raises(ConfigError, match=f"{tmp_path}.*'side': 16.*'side': 8"):
-        drawn(tmp_path, side=8)
-    record = json.loads((tmp_path / "pool.json").read_text())
-    assert set(record["sha256"]) == {"00000.npy", "00001.npy", "00002.npy"}
-
-
-def test_a_pool_is_a_whole_number_of_shards(tmp_path):
+def test_pools_of_another_kind_and_parts_of_shards_are_refused(whole, tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r"pool\.objects=100"):
         drawn(tmp_path, count=100)
+    monkeypatch.setattr(pool_module, "SHARD", 2)
+    with pytest.raises(ConfigError, match=f"{whole}.*'side': 16.*'side': 8"):
+        drawn(whole, side=8)
 
 
 def test_records_tell_the_truth():
@@ -178,18 +182,12 @@ def test_a_pool_in_memory_gives_what_one_on_disk_gives():
     names = disk.shards[0].dtype.names
     disk.resident = {name: torch.tensor(disk.shards[0][name]) for name in names}
     held, disk.resident = disk.records(numbers), None
-    assert {name: value.dtype for name, value in held.items()} == {
-        name: value.dtype for name, value in disk.records(numbers).items()
-    }
-    assert all(torch.equal(held[name], value) for name, value in disk.records(numbers).items())
+    read = disk.records(numbers)
+    assert same(held, read)
+    assert [held[name].dtype for name in read] == [value.dtype for value in read.values()]
 
 
-@pytest.mark.slow
-def test_processes_generate_the_same_shards(tmp_path):
-    folders = tmp_path / "one", tmp_path / "two"
-    for folder, workers in zip(folders, (1, 2), strict=True):
-        seeds = TRAINING_SEEDS[: 2 * pool_module.SHARD]
-        ensure_pool(folder, seeds, views=2, side=8, workers=workers, announce=silent)
-    one, two = (json.loads((folder / "pool.json").read_text()) for folder in folders)
+def test_processes_generate_the_same_shards(short_shards, whole, tmp_path):
+    drawn(tmp_path, workers=2)
+    one, two = ((folder / "pool.json").read_text() for folder in (whole, tmp_path))
     assert one == two
-    assert len(one["sha256"]) == 2

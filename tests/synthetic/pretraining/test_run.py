@@ -45,7 +45,6 @@ def state(run):
     return torch.load(run / CHECKPOINT, weights_only=True)
 
 
-@pytest.mark.slow
 def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, pool_folder, monkeypatch, capsys):
     steps = "schedule.max_steps=6"
     assert command(tmp_path / "whole", pool_folder, steps) == 0
@@ -82,25 +81,19 @@ def finished(tmp_path_factory, pool_folder):
     return folder
 
 
-def test_another_model_is_not_resumed_in_the_same_folder(finished, pool_folder, capsys):
-    assert command(finished, pool_folder, "schedule.max_steps=1", "model.width=24") == 1
-    assert f"run={finished}" in capsys.readouterr().err
-
-
-def test_finer_planes_are_initialised_from_a_finished_run(finished, tmp_path, pool_folder, capsys):
-    coarse = f"init_from={finished}/tiny.safetensors"
-    finer = ("model.low_resolution=8", coarse, "schedule.max_steps=1")
-    assert command(tmp_path / "fine", pool_folder, *finer) == 0
-    assert command(tmp_path / "wrong", pool_folder, *finer, "model.width=24") == 1
-    assert "init_from=" in capsys.readouterr().err
-
-
-def test_weights_of_a_model_that_differs_in_more_are_refused(
+def test_finer_planes_alone_are_initialised_from_a_finished_run(
     finished, tmp_path, pool_folder, capsys
 ):
-    coarse = f"init_from={finished}/tiny.safetensors"
-    assert command(tmp_path, pool_folder, coarse, "schedule.max_steps=1", "model.distance=5") == 1
-    assert "init_from=" in capsys.readouterr().err
+    """Neither are other models, nor is another one resumed in the same folder."""
+    coarse = ("schedule.max_steps=1", f"init_from={finished}/tiny.safetensors")
+    assert command(tmp_path / "fine", pool_folder, *coarse, "model.low_resolution=8") == 0
+    for run, words, overrides in (
+        (tmp_path / "wrong", "init_from=", (*coarse, "model.low_resolution=8", "model.width=24")),
+        (tmp_path / "other", "init_from=", (*coarse, "model.distance=5")),
+        (finished, f"run={finished}", ("schedule.max_steps=1", "model.width=24")),
+    ):
+        assert command(run, pool_folder, *overrides) == 1
+        assert words in capsys.readouterr().err
 
 
 def test_a_damaged_or_used_run_is_said_in_words(finished, tmp_path, pool_folder, capsys):
@@ -110,16 +103,15 @@ def test_a_damaged_or_used_run_is_said_in_words(finished, tmp_path, pool_folder,
     with alone_in(run):
         assert command(run, pool_folder, steps) == 1
     assert "in use" in capsys.readouterr().err
-    whole = (run / CHECKPOINT).read_bytes()
-    (run / CHECKPOINT).write_bytes(whole[: len(whole) // 2])
-    assert command(run, pool_folder, steps) == 1
-    assert "last.ckpt is damaged: delete it" in capsys.readouterr().err
-    (run / CHECKPOINT).write_bytes(whole)
-    settings = (run / "config.json").read_text()
-    (run / "config.json").write_text(settings[:50])
-    assert command(run, pool_folder, steps) == 1
-    assert "config.json is damaged" in capsys.readouterr().err
-    (run / "config.json").write_text(settings)
+    for name, words in (
+        (CHECKPOINT, "last.ckpt is damaged: delete it"),
+        ("config.json", "config.json is damaged"),
+    ):
+        whole = (run / name).read_bytes()
+        (run / name).write_bytes(whole[: len(whole) // 2])
+        assert command(run, pool_folder, steps) == 1
+        assert words in capsys.readouterr().err
+        (run / name).write_bytes(whole)
     assert command(run, pool_folder, steps) == 0
 
 
@@ -134,21 +126,21 @@ def test_a_score_that_fails_loses_no_step(tmp_path, pool_folder, monkeypatch):
 
 
 def module(*overrides):
+    """The settings, and a module that learns without a trainer."""
     config = small_config("schedule.max_steps=40", "schedule.render_from=0", *overrides)
     model = init_model(small_sizes(), 0)
-    return config, PretrainingModule(model, config.batch, config.schedule, 0, bf16=False)
+    taught = PretrainingModule(model, config.batch, config.schedule, 0, bf16=False)
+    optimizers = taught.configure_optimizers()
+    taught.optimizers = lambda: optimizers
+    taught.manual_backward = lambda loss: loss.backward()
+    return config, taught
 
 
 def test_losses_fall():
     config, taught = module("schedule.muon_lr=0.02", "schedule.adam_lr=0.01")
-    optimizers = taught.configure_optimizers()
-    taught.optimizers = lambda: optimizers
-    taught.manual_backward = lambda loss: loss.backward()
-    batch = config.batch
-    data = PretrainingBatches(
-        small_pool(3), taught.model.view, seed=0, objects=3, near=batch.near, volume=batch.volume,
-        free=batch.free, colour=batch.colour, rays=batch.rays,
-    )  # fmt: skip
+    counts = ("objects", "near", "volume", "free", "colour", "rays")
+    counts = {name: getattr(config.batch, name) for name in counts}
+    data = PretrainingBatches(small_pool(3), taught.model.view, seed=0, **counts)
     loss, parts = taught.losses(data.draw(0))
     first, options = float(loss.detach()), config.schedule
     parts = {name: float(value) for name, value in parts.items()}
@@ -171,18 +163,14 @@ def test_every_parameter_has_one_optimizer_and_rates_rise_stay_and_fall():
     _, taught = module("schedule.warmup_steps=4", "schedule.decay_share=0.5")
     listed = [p for o in taught.configure_optimizers() for g in o.param_groups for p in g["params"]]
     assert len(listed) == len(set(map(id, listed))) == len(list(taught.model.parameters()))
-    rates = []
-    for taught.steps in (0, 3, 10, 20, 30, 40):
-        rates.append(taught.rate)
-    assert rates == [0.25, 1, 1, 1, 0.5, 0]
+    expected = {0: 0.25, 3: 1, 10: 1, 20: 1, 30: 0.5, 40: 0}
+    for taught.steps, rate in expected.items():
+        assert taught.rate == rate
 
 
 @pytest.mark.parametrize("kind", ["loss", "gradient"])
 def test_what_is_not_finite_changes_no_weight_and_ends_training_with_a_message(monkeypatch, kind):
     _, taught = module()
-    optimizers = taught.configure_optimizers()
-    taught.optimizers = lambda: optimizers
-    taught.manual_backward = lambda loss: loss.backward()
     first = next(taught.model.parameters())
     start = first.detach().clone()
 

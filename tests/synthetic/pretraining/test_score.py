@@ -74,12 +74,6 @@ def test_a_model_that_knows_the_answer_scores_high():
     assert score(wrong, subject).values["iou"] < 0.7  # type: ignore[arg-type]
 
 
-def test_overlap_counts_points():
-    yes, no = torch.tensor([True, True, False]), torch.tensor([False, True, True])
-    assert overlap(yes, no) == pytest.approx(1 / 3)
-    assert overlap(no & False, yes & False) == 1
-
-
 def test_subjects_are_held_out_objects_and_demo_scenes():
     first = next(held_out(1))
     assert first.cameras.shape == (4, 4, 4)
@@ -95,10 +89,8 @@ def test_subjects_are_held_out_objects_and_demo_scenes():
 def test_scores_and_sheets_are_written(tmp_path, monkeypatch):
     monkeypatch.setattr(score_module, "GRID", 8)
     monkeypatch.setattr(score_module, "demo_subjects", lambda: held_out(1))
-    lines = []
-    table = score_all(
-        init_model(small_sizes(), 0).eval(), tmp_path, objects=2, announce=lines.append
-    )
+    lines, model = [], init_model(small_sizes(), 0).eval()
+    table = score_all(model, tmp_path, objects=2, announce=lines.append)
     written = json.loads((tmp_path / "scores.json").read_text())
     assert written["mean"] == table
     assert set(written["objects"]) == {"object 0", "object 1"}
@@ -107,7 +99,10 @@ def test_scores_and_sheets_are_written(tmp_path, monkeypatch):
     assert (tmp_path / "failures.png").is_file()
 
 
-def test_quick_scores_need_no_rendering_of_objects():
+def test_quick_scores_need_no_rendering_of_objects_and_overlap_counts_points():
+    yes, no = torch.tensor([True, True, False]), torch.tensor([False, True, True])
+    assert overlap(yes, no) == pytest.approx(1 / 3)
+    assert overlap(no & False, yes & False) == 1
     values = QuickLook(small_pool(2), 2).scores(init_model(small_sizes(), 0))
     assert 0 <= values["iou"] <= 1
     assert 3 < values["psnr_novel"] < 30

@@ -9,6 +9,7 @@ from xplanes.config import CONF
 from xplanes.lrm.alignment import align
 from xplanes.lrm.config import parse_config
 from xplanes.lrm.weights import FOLDER, bundled_models, load_bundled
+from xplanes.scenes.cameras import focal_length
 from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE, camera_at
 from xplanes.synthetic.pretraining import score as score_module
 from xplanes.synthetic.pretraining.pool import FOCAL
@@ -40,22 +41,15 @@ def test_the_weights_are_of_the_described_model(models):
 
 def test_a_dnerf_camera_is_its_own(models):
     """The similarity that takes such a camera to the model's own is exact."""
-    focal = 0.5 * 96 / torch.tan(torch.tensor(0.5 * CAMERA_ANGLE_X, dtype=torch.float64))
+    picture = {"focal": focal_length(CAMERA_ANGLE_X, 96), "height": 96, "width": 96}
     for name, model in models.items():
-        found = align(
-            camera_at(30.0, 20.0),
-            focal=float(focal),
-            height=96,
-            width=96,
-            target=torch.zeros(3),
-            view=model.view,
-        )
+        pose, target = camera_at(30.0, 20.0), torch.zeros(3)
+        found = align(pose, **picture, target=target, view=model.view)
         assert found.mismatch.largest < 1e-9, name
         scale = model.view.distance / CAMERA_DISTANCE
         assert found.frame.scale == pytest.approx(scale), name
 
 
-@pytest.mark.slow
 def test_it_reconstructs_held_out_objects(models, monkeypatch):
     monkeypatch.setattr(score_module, "GRID", 24)
     _, subject = held_out(2)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.synthetic.rays import rays
 from xplanes.scenes.cameras import cast_rays
 from xplanes.synthetic.demo.render import render_image
 from xplanes.synthetic.demo.scenes import DEMO_SCENES, build_demo_scene
@@ -16,14 +17,10 @@ from xplanes.synthetic.pretraining.objects import (
 from xplanes.synthetic.pretraining.pool import FOCAL, camera, cast, inside, render_solids
 from xplanes.synthetic.pretraining.solids import (
     BOX,
-    BRICKS,
     CAPSULE,
-    CHECKER,
     CYLINDER,
     ELLIPSOID,
     PLAIN,
-    SECTORS,
-    STRIPES,
     TORUS,
     Solids,
 )
@@ -37,41 +34,20 @@ SIZES = {
     CAPSULE: (0.2, 0.5, 1.0),
     TORUS: (0.6, 0.2, 1.0),
 }
-NUMBERS = {
-    PLAIN: (0.1, 0.3, 0.0, 0.0),
-    STRIPES: (1.0, 0.13, 3.0, 0.0),
-    CHECKER: (0.2, 0.15, 0.3, 2.0),
-    BRICKS: (0.3, 0.12, 0.02, 0.0),
-    SECTORS: (8.0, 2.0, 0.0, 0.0),
-}
 
 
-def one(kind, pattern=PLAIN, light=LIGHT):
+def one(kind, light=LIGHT):
     paints = [[[0.9, 0.3, 0.1], [0.2, 0.5, 0.8], [0.6, 0.9, 0.4]]]
-    return Solids(
-        np.array([kind]),
-        np.array([SIZES[kind]]),
-        np.eye(3)[None],
-        np.zeros((1, 3)),
-        np.array([pattern]),
-        np.array(paints),
-        np.array([NUMBERS[pattern]]),
-        np.array(light),
-    )
-
-
-def rays(count, seed=0):
-    random = np.random.default_rng(seed)
-    origins = random.normal(size=(count, 3))
-    origins *= 3 / np.linalg.norm(origins, axis=-1, keepdims=True)
-    directions = random.uniform(-0.9, 0.9, (count, 3)) - origins
-    return origins, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    numbers = np.array([[0.1, 0.3, 0.0, 0.0]])
+    place = (np.eye(3)[None], np.zeros((1, 3)))
+    kinds, sizes, patterns = np.array([kind]), np.array([SIZES[kind]]), np.array([PLAIN])
+    return Solids(kinds, sizes, *place, patterns, np.array(paints), numbers, np.array(light))
 
 
 def compare(solids, count, case, seed=0):
-    origins, directions = rays(count, seed)
-    distance, part, normal, colour = cast(solids, origins, directions)
-    truth = solids.posed().cast(torch.from_numpy(origins), torch.from_numpy(directions))
+    origins, directions = rays(count, seed, distance=3.0, spread=0.9)
+    distance, part, normal, colour = cast(solids, origins.numpy(), directions.numpy())
+    truth = solids.posed().cast(origins, directions)
     agree = part == truth.part.numpy()
     assert agree.mean() > 0.995, case  # silhouettes are decided by rounding
     hit = agree & (part >= 0)
@@ -82,12 +58,9 @@ def compare(solids, count, case, seed=0):
     assert np.quantile(np.abs(colour - truth.colour.numpy())[hit], 0.98) < 1e-2, case
 
 
-def test_rays_meet_each_solid_where_the_reference_says():
+def test_rays_meet_solids_and_whole_objects_with_shadows_where_the_reference_says():
     for kind in SIZES:
         compare(one(kind), 2000, f"solid {kind}")
-
-
-def test_whole_objects_with_shadows_agree():
     for seed in (0, 3, 11, HELD_OUT_SEEDS[2]):
         compare(procedural_object(seed), 1500, f"seed {seed}", seed)
 
@@ -110,14 +83,9 @@ def test_images_agree_with_the_demo_renderer():
     assert np.abs(alpha - truth[..., 3]).mean() < 1e-3
     assert np.abs(colour - on_white).mean() < 4e-3
     line = torch.arange(48, dtype=torch.float64) - 0.25
-    rows, columns = torch.meshgrid(line, line, indexing="ij")
-    origins, directions = cast_rays(
-        torch.from_numpy(pose),
-        rows.flatten(),
-        columns.flatten(),
-        focal=48 * FOCAL,
-        centre=(24.0, 24.0),
-    )
+    pixels = torch.cartesian_prod(line, line).T
+    camera_rays = {"focal": 48 * FOCAL, "centre": (24.0, 24.0)}
+    origins, directions = cast_rays(torch.from_numpy(pose), *pixels, **camera_rays)
     distance = cast(solids, origins.numpy().copy(), directions.numpy())[0]
     seen = np.isfinite(distance)
     assert (np.isfinite(depth.ravel()) == seen).mean() > 0.999
@@ -125,13 +93,10 @@ def test_images_agree_with_the_demo_renderer():
     assert np.quantile(np.abs(depth.ravel()[both] - distance[both]), 0.99) < 1e-6
 
 
-def test_objects_are_deterministic_and_differ_by_seed():
+def test_objects_depend_on_their_seed_and_stay_where_cameras_see_them():
     first, again, other = (procedural_object(seed) for seed in (4, 4, 5))
     assert all((a == b).all() for a, b in zip(first.arrays, again.arrays, strict=True))
     assert len(first.kinds) != len(other.kinds) or (first.sizes != other.sizes).any()
-
-
-def test_objects_stay_where_cameras_see_them():
     for seed in range(40):
         low, high = procedural_object(seed).bounds()
         assert (0.5 * (high - low)).max() < 1.11

@@ -3,6 +3,7 @@
 import functools
 import json
 import math
+import shutil
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -212,6 +213,14 @@ def test_captures_have_a_world_behind_and_masks_of_the_thing(name, tmp_path):
         border = np.concatenate([colours[0], colours[-1], colours[:, 0], colours[:, -1]])
         assert len(np.unique(border // 16, axis=0)) > 8
         assert 0.03 < (mask > 127).mean() < 0.5
+
+
+def test_masks_that_are_gone_are_rendered_again(tmp_path):
+    data = suite_data(tmp_path, "phone", views=(2, 1, 1))
+    masks = data.read().splits["train"].foreground
+    for gone in (data.folder / MASKS / "train" / "r_001.png", data.folder / MASKS):
+        shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
+        assert torch.equal(data.read().splits["train"].foreground, masks)
 
 
 def test_masks_of_a_thing_cut_it_out_where_that_is_asked_for(tmp_path):

@@ -175,7 +175,8 @@ def _ensure(
     world: World | None = None,
 ) -> Path:
     """Render a scene to a folder unless the folder matches the record."""
-    if _holds(folder, record):
+    masked = world is not None
+    if _holds(folder, record, masked):
         return folder
     total, resolution = sum(record["views"].values()), record["resolution"]
     announce(f"Rendering {title} ({total} images of {resolution} px) to {folder}")
@@ -187,7 +188,7 @@ def _ensure(
             for split in capture.shots:
                 _write_split(fresh, split, capture, assembly, resolution, world)
         (fresh / RECORD).write_text(json.dumps(record, indent=2) + "\n")
-        _publish(fresh, folder, record)
+        _publish(fresh, folder, record, masked)
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
     return folder
@@ -244,16 +245,21 @@ def _folder_name(name: str, resolution: int, seed: int, counts: dict[str, int]) 
     return f"{name}_{resolution}px_s{seed}{suffix}"
 
 
-def _holds(folder: Path, record: dict[str, Any]) -> bool:
-    """Whether a folder matches the record and has all its files."""
+def _holds(folder: Path, record: dict[str, Any], masked: bool) -> bool:
+    """Whether a folder matches the record and has all its files, ``masked`` ones with masks."""
     try:
         if json.loads((folder / RECORD).read_text()) != record:
             return False
     except (OSError, ValueError):
         return False
+    places = (folder, folder / MASKS) if masked else (folder,)
     return all(
         (folder / f"transforms_{split}.json").is_file()
-        and all((folder / split / f"r_{number:03d}.png").is_file() for number in range(count))
+        and all(
+            (place / split / f"r_{number:03d}.png").is_file()
+            for place in places
+            for number in range(count)
+        )
         for split, count in record["views"].items()
     )
 
@@ -272,9 +278,9 @@ def _clear_unfinished(folder: Path) -> None:
             shutil.rmtree(path, ignore_errors=True)
 
 
-def _publish(fresh: Path, folder: Path, record: dict[str, Any]) -> None:
+def _publish(fresh: Path, folder: Path, record: dict[str, Any], masked: bool) -> None:
     """Move a finished folder into place, unless another process was first."""
-    while not _holds(folder, record):
+    while not _holds(folder, record, masked):
         stale = _sibling(folder)
         try:
             if folder.exists():

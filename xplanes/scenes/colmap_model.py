@@ -39,6 +39,16 @@ LENSES: dict[str, tuple[int, LensModel, str]] = {
 }
 """COLMAP's camera models: their numbers in binary files, and their parameters in order."""
 
+PANORAMA = "EQUIRECTANGULAR"
+UNREAD = {
+    11: "RAD_TAN_THIN_PRISM_FISHEYE",
+    12: "SIMPLE_DIVISION",
+    13: "DIVISION",
+    16: "EUCM",
+    17: PANORAMA,
+}
+"""Camera models that are not read, by their numbers."""
+
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "sparse_/0", "sparse_", "colmap/sparse")
 """Usual folders of sparse models. A model in colmap/ was converted to a transforms.json."""
 
@@ -262,7 +272,7 @@ def _cameras(path: Path) -> Iterator[tuple[str, int, Lens]]:
         with _binary(path) as file:
             for what in file.entries("camera"):
                 camera, number, width, height = file.take(CAMERA, what)
-                model, count = models.get(number, (f"number {number}", 0))
+                model, count = models.get(number, (UNREAD.get(number, f"number {number}"), 0))
                 values = file.take(struct.Struct(f"<{count}d"), what)
                 yield f"{path}: camera {camera}", camera, (model, width, height, values)
         return
@@ -350,10 +360,11 @@ def _calibration(
     label: str, model: str, width: int, height: int, values: Sequence[float]
 ) -> Calibration:
     if model not in LENSES:
+        undistort = "Undistort the images with colmap image_undistorter, or use one of these"
+        cut = "COLMAP does not undistort it: cut perspective images out of it, and calibrate them"
         raise SceneError(
             f"{label} has the camera model {model}, which is not read. These are: "
-            f"{', '.join(LENSES)}. Undistort the images with colmap image_undistorter, or "
-            "calibrate with one of these."
+            f"{', '.join(LENSES)}. {cut if model == PANORAMA else undistort}."
         )
     _, lens, kind = LENSES[model]
     names = kind.split()

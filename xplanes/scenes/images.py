@@ -16,7 +16,7 @@ from xplanes.scenes.formats import SIXTEEN_BIT_MODES, open_image, read_header
 from xplanes.scenes.masks import MaskKind, read_mask
 from xplanes.scenes.store import Size
 
-EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "P", "PA", "1")
+EIGHT_BIT_MODES = ("RGBA", "RGB", "CMYK", "LA", "L", "P", "PA", "1")
 
 GREY = MaskKind(labels=False)
 """Kind of grey masks, from black to white."""

@@ -85,6 +85,9 @@ MATRICES = ("intrinsic_matrix", "intrinsics", "K")
 TRANSPARENT = {"white_transparent": 255, "black_transparent": 0}
 """Keys of instant-ngp that declare a grey level transparent, with this level."""
 
+FLAGS = ("is_fisheye", *TRANSPARENT)
+"""Keys that are true or false."""
+
 KNOWN = (
     *("frames", "file_path", "transform_matrix", "transform_matrix_start", "mask_path"),
     *("camera_model", "is_fisheye", "distortion_params", "orientation_override", "up"),
@@ -210,15 +213,22 @@ class _Frame(NamedTuple):
 
 
 def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame]:
-    """Usable frames; warns about those without image, finite pose, or time if most have one."""
+    """Usable frames; warns about those without image, finite pose, or time if most have one.
+
+    A frame that is listed again, equal in all its keys, is left out, too.
+    """
     entries = content["frames"]
     key = _key(entries)
     timed = sum(entry.get(key) is not None for entry in entries)
     smaller: list[Path] = []
+    listed: dict[str, int] = {}
 
     def read(item: tuple[int, dict[str, Any]]) -> _Frame:
         index, entry = item
         label = f"{path}: frame {index} ({entry['file_path']})"
+        first = listed.setdefault(str(entry["file_path"]), index)
+        if first < index and entry == entries[first]:
+            raise BrokenFrameError(f"{label} is listed before, as frame {first}.")
         image, mask, is_smaller = _files_of(label, folder, content, entry)
         if is_smaller:
             smaller.append(image)
@@ -407,7 +417,7 @@ def _has_content(value: Any) -> bool:
 
 
 def _standard(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
-    """The keys in standard form: strings as numbers, and alternative intrinsics by standard keys.
+    """The keys in standard form: strings as values, and alternative intrinsics by standard keys.
 
     Fields of view are converted to radians. instant-ngp's x_fov, which takes precedence over focal
     lengths, and its converter's fovx are in degrees.
@@ -419,6 +429,9 @@ def _standard(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
     for key in {*NUMBERS} & {*found}:
         if isinstance(found[key], str) and (number := number_in(found[key])) is not None:
             found[key] = number
+    for key in {*FLAGS} & {*found}:
+        if isinstance(found[key], str) and found[key].lower() in ("true", "false"):
+            found[key] = found[key].lower() == "true"
     for key in {*MATRICES} & {*keys}:
         with suppress(TypeError, ValueError, LookupError):
             matrix = np.array(keys[key], dtype=np.float64)

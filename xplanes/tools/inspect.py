@@ -177,13 +177,15 @@ def _recognised(folder: Path, changed: Sequence[str]) -> tuple[Path, str]:
     scenes = f" Scenes inside it: {', '.join(inside)}." if inside else ""
     packed = sorted(path.name for path in folder.iterdir() if path.suffix in ARCHIVES)
     unpack = f" Unpack {some(packed)} first." if packed else ""
+    others = sorted(path.name for path in folder.glob("transforms_*.json"))
+    join = f" Join the frames of {some(others)} in a transforms.json." if others else ""
     there = [f"{path.name}{'/' * path.is_dir()}" for path in folder.iterdir()]
     wanted = "; ".join(f"{name}: {cls.files}" for cls, name in known.items() if cls.files)
     raise SceneError(
         f"{folder} is not a scene of a known format.{scenes} It contains "
-        f"{some(sorted(there)) or 'nothing'}.{unpack} What the formats need: {wanted}. Choose one "
-        "with data=NAME; raw exports of Polycam, Record3D, Metashape and other programs become "
-        "nerfstudio's format with its ns-process-data"
+        f"{some(sorted(there)) or 'nothing'}.{unpack}{join} What the formats need: {wanted}. "
+        "Choose one with data=NAME; raw exports of Polycam, Record3D, Metashape and other "
+        "programs become nerfstudio's format with its ns-process-data"
     )
 
 
@@ -386,7 +388,7 @@ def table(capture: Capture) -> str:
     elif known["splits"]["train"]["timesteps"] == 1:
         text.append(
             "static  all training views have the same time, so nothing can move; if something "
-            "does, the scene's files must give the times"
+            'does, the files must give the times (in transforms files, "time" of each frame)'
         )
     if (cube := known["cube"]) is not None:
         centre = ", ".join(f"{value:.3g}" for value in cube["centre"])

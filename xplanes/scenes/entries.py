@@ -401,8 +401,8 @@ def world_turn(
             "are stored, and up vectors follow EXIF",
             *(turned_photos, len(paths)),
         )
-    aside = torch.tensor([UP.get(tag, (0, 1)) for tag in tags], dtype=torch.float64)
-    up = (poses[:, :3, :2].double() * aside[:, None]).sum(dim=2)
+    image_up = torch.tensor([UP.get(tag, (0, 1)) for tag in tags], dtype=torch.float64)
+    up = (poses[:, :3, :2].double() * image_up[:, None]).sum(dim=2)
     if (rotation := upright(up)) is None:
         if orient:
             warn(

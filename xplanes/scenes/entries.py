@@ -55,10 +55,10 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
     """The file that ``name`` refers to inside ``folder``.
 
     The suffix may be missing or that of another format, and the name may differ in case or in the
-    encoding of accents, as long as only one file matches; it may be percent-encoded. If a path does
-    not exist, such as one of another machine, its first folders are dropped; in a relative name,
-    not that of a split, nor any if its own folder exists. What is then left without folders is also
-    tried in images.
+    encoding of accents, as long as only one file matches; it may be percent-encoded. If there is no
+    such path, its first folders are dropped one by one, as it may be a path of another machine.
+    Relative names keep the folder of a split, and all folders if the last one exists. A name
+    without folders is also looked up in the folder ``images``.
 
     Args:
         label: The file and frame that name it, for messages.

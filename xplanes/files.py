@@ -20,7 +20,7 @@ MARK = ".tmp-"
 """Part of the name of every file that is still being written."""
 
 DAY = 86_400.0
-"""Age in seconds (one day) after which an unfinished file in a cache counts as abandoned."""
+"""Seconds of a day; older unfinished files in a cache count as abandoned."""
 
 
 class StorageError(XPlanesError, OSError):

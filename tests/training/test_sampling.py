@@ -55,12 +55,12 @@ def test_images_of_the_trained_field_have_samples_of_their_own(monkeypatch):
 
 def test_room_follows_the_samples_of_batches_and_pictures_need_none():
     sampling = sampler(fog, samples_per_batch=8192)
-    assert sampling._training.room == 10240
+    assert sampling._training_renderer.room == 10240
     for samples, room in ((3000, 4096), (1, 1024), (10**6, 10240)):
         sampling.expect(samples)
-        assert sampling._training.room == room, samples
+        assert sampling._training_renderer.room == room, samples
     assert sampling.renderer.room is None
-    assert sampler(fog)._training.room is None
+    assert sampler(fog)._training_renderer.room is None
 
 
 def test_no_samples_for_images_are_refused():

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_BLOCK_ELEMENTS = {"cpu": 1 << 20, "cuda": 1 << 27}
-_SINGLE_PRECISION_ERROR = 3e-9
-_NARROW_FROM_COLUMNS = 96
-_LARGEST = 1e6
-_SPARSE_FLOOR = 0.05
-_CHECK_EVERY = 4
-CHANGE_OVER_TOLERANCE = 10.0
+_BLOCK_ELEMENTS = {"cpu": 1 << 20, "cuda": 1 << 27}  # Matrix entries per block.
+_SINGLE_PRECISION_ERROR = 3e-9  # See `needs_double`.
+_NARROW_FROM_COLUMNS = 96  # Columns from which two thin products may be faster.
+_LARGEST = 1e6  # Maximum of penalty * |Y|.
+_SPARSE_FLOOR = 0.05  # Least |S| / |Y| in relative residuals.
+_CHECK_EVERY = 4  # Iterations between checks of convergence.
+CHANGE_OVER_TOLERANCE = 10.0  # Ratio of the bounds on relative change and residual.
 
 # The adaptive penalty: these values minimise the iterations on matrices like LRM features.
 _RELAXATION = 1.6

@@ -54,9 +54,9 @@ def _hat(positions: Tensor, size: int) -> Tensor:
     return (1 - (positions[:, None] - nodes).abs()).clamp_min(0)
 
 
-_SLICES = 256
-_POWER_ITERATIONS = 30
-_SWEEPS = 15
+_SLICES = 256  # Slices that are factorised together.
+_POWER_ITERATIONS = 30  # For each slice.
+_SWEEPS = 15  # Passes of alternating least squares over all factors.
 
 
 def rank1_factors(planes: Tensor) -> tuple[Tensor, Tensor]:

@@ -88,7 +88,7 @@ def header(
     done, trained = (0, 0.0) if checkpoint is None else training_so_far(checkpoint)
     lines = {
         "xplanes": f"{__version__} · torch {torch.__version__} · {device} · "
-        f"{torch.get_num_threads()} threads · decoder {module.field.precision} · "
+        f"{torch.get_num_threads()} threads · precision {module.field.precision} · "
         f"{backend.name(device)}",
         "run": str(run),
         **({"resumed": f"after step {done}, {trained:.0f} s of training"} if done else {}),

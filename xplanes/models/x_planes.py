@@ -266,15 +266,15 @@ class XPlanesModel(Model):
         initial: InitialValues | None = None,
     ) -> None:
         self._field, self.settings, self.weights = field, settings, settings.loss
-        self.fine = None if field.fine is None else settings.fine
+        self.fine_settings = None if field.fine is None else settings.fine
         self.total_variation = self.weights.total_variation
         if field.background is not None:
             self.weights = settings.loss.with_learnt_background()
             if site.initialised:  # Its surfaces stop light already.
                 self.weights = replace(self.weights, passing=0.0)
             self.total_variation = self.weights.total_variation_with_background
-        elif self.fine is not None:
-            self.total_variation = self.fine.coarse_variation
+        elif self.fine_settings is not None:
+            self.total_variation = self.fine_settings.coarse_variation
         views = len(site.times)
         steps = self.weights.initial_steps
         self.fade = None if steps is None else steps / views / site.batch_scale
@@ -315,8 +315,8 @@ class XPlanesModel(Model):
         groups: list[Group] = [{"params": [field.space], "lr": settings.plane_lr, "name": "space"}]
         if field.time is not None:
             groups.append({"params": [field.time], "lr": settings.time_lr, "name": "time"})
-        if field.fine is not None and self.fine is not None:
-            groups.append({"params": [field.fine], "lr": self.fine.lr, "name": "fine"})
+        if field.fine is not None and self.fine_settings is not None:
+            groups.append({"params": [field.fine], "lr": self.fine_settings.lr, "name": "fine"})
         decoder = [p for p in field.decoder.parameters() if p.requires_grad]
         if decoder:
             groups.append({"params": decoder, "lr": settings.decoder_lr, "name": "decoder"})
@@ -326,7 +326,7 @@ class XPlanesModel(Model):
 
     def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         terms = super().losses(rendering, rays, state)
-        if weight := self._passing(state.step):
+        if weight := self._passing_weight(state.step):
             terms["passing"] = weight * ray_mean(1 - rendering.opacity, rays)
         if (background := self._field.background) is not None:
             if (options := self.settings.background) is not None:
@@ -343,7 +343,7 @@ class XPlanesModel(Model):
         return warm_cosine(step, progress, warmup=self.warmup, final=self.settings.final_lr)
 
     def rate_of(self, group: str, step: int, progress: float) -> float:
-        if group == "time" and self._passing(step):
+        if group == "time" and self._passing_weight(step):
             return 0.0
         if group != "fine":
             return self.rate(step, progress)
@@ -395,9 +395,9 @@ class XPlanesModel(Model):
             name: (weight, partial(total_variation, plane, dims))
             for name, (plane, dims, weight) in self._variation().items()
         }
-        if (world := field.background) is not None and (options := self.settings.background):
+        if (background := field.background) is not None and (options := self.settings.background):
             variation = options.total_variation
-            terms["background"] = (variation, lambda: total_variation(world.planes, (1, 2)))
+            terms["background"] = (variation, lambda: total_variation(background.planes, (1, 2)))
         if self._initial:
             terms["initialisation"] = (fading * self.initial_weight, self._distance)
         if (time := field.time) is not None:
@@ -420,7 +420,7 @@ class XPlanesModel(Model):
         if time is not None:
             weight = self.weights.time_variation * (2 * len(time) if coded else 1)
             found["time_variation"] = (time, (1, 2) if coded else (2,), weight)
-        if (fine := self._field.fine) is not None and (options := self.fine):
+        if (fine := self._field.fine) is not None and (options := self.fine_settings):
             found["fine_variation"] = (fine, (1, 2), options.total_variation)
         return found
 
@@ -431,7 +431,7 @@ class XPlanesModel(Model):
             for plane, initial in self._initial
         )
 
-    def _passing(self, step: int) -> float:
+    def _passing_weight(self, step: int) -> float:
         """Weight of the cube's mean transmittance; 0 without a learnt background."""
         steps = self.weights.passing_steps
         if self._field.background is None or not steps:

@@ -277,8 +277,9 @@ def _rendered(
         Intrinsics.shared(focal, side, side, count),
         tuple(f"fixed_{number:03d}.png" for number in range(count)),
     )
-    trained = f"{options.fixed_view_model} trained for {_budget(options)}"
-    description = f"{count} frames rendered by {trained}"
+    description = (
+        f"{count} frames rendered by {options.fixed_view_model} trained for {_budget(options)}"
+    )
     return FixedView(views, frame.centre, stage.seconds, description)
 
 
@@ -347,7 +348,10 @@ def _render(
     count: int,
     back: float,
 ) -> Tensor:
-    """Frames at evenly spaced timesteps, premultiplied. uint8 [T, side, side, 4]"""
+    """Premultiplied frames at evenly spaced timesteps; ray origins are moved by ``back`` backwards.
+
+    uint8 [T, side, side, 4]
+    """
     renderer = module.renderer
     assert isinstance(renderer, RayRenderer)
     device = renderer.device

@@ -222,7 +222,7 @@ def from_sequence(
     device = place.device
     parts = decompose_stage(sequence.triplanes, method.decomposition, cache, device)
     low_rank, sparse, report = (parts.content[name] for name in ("low_rank", "sparse", "report"))
-    _warn(report, method)
+    _warn_unless_converged(report, method)
     planes = convert_stage(parts, model, method.decomposition, method.seed, cache, device)
     regularised = model.plane_set != "three" and model.loss.sparse_weight > 0
     target, unexplained = sparse if regularised else None, planes.content["unexplained"]
@@ -261,18 +261,18 @@ def _settings_for(
     return model
 
 
-def _warn(report: Mapping[str, Mapping[str, Any]], method: Method) -> None:
+def _warn_unless_converged(report: Mapping[str, Mapping[str, Any]], method: Method) -> None:
     """Warn once about all orientations that did not converge."""
-    open_ones = [
+    unconverged = [
         f"{name} (residual {each['residual']:.1e}, last step {each['change']:.1e})"
         for name, each in report.items()
         if not each["converged"]
     ]
-    if open_ones:
+    if unconverged:
         logger.warning(
             "the decomposition of %s did not converge within decomposition.max_iterations=%d to "
             "decomposition.tolerance=%g (ten times that for the last step): raise one of them",
-            ", ".join(open_ones),
+            ", ".join(unconverged),
             method.decomposition.max_iterations,
             method.decomposition.tolerance,
         )

@@ -169,11 +169,11 @@ def convert_stage(
     moving = model.plane_set != "three"
     sparse = parts.content["sparse"] if moving else None
 
-    def begin(dynamic: str, moved: Tensor) -> Tensor:
+    def initial_planes(dynamic: str, target: Tensor) -> Tensor:
         rows = model.time_resolution
-        assert rows != "half", "the sequence settles it"
+        assert rows != "half", "from_sequence replaces it by a number"
         return time_planes(
-            moved,
+            target,
             plane_set=model.plane_set,
             dynamic=dynamic,
             resolution=model.texels_of_time,
@@ -187,16 +187,16 @@ def convert_stage(
         space = space_planes(low_rank, static=config.static, resolution=model.resolution)
         content: dict[str, Any] = {"space": space.cpu(), "time": None, "unexplained": {}}
         if sparse is not None:
-            moved = sparse.to(device)
-            begun = begin(config.dynamic, moved)
-            content["time"] = begun.cpu()
+            target = sparse.to(device)
+            initial = initial_planes(config.dynamic, target)
+            content["time"] = initial.cpu()
             content["unexplained"] = {
-                "before": unexplained_energy(begin("random", moved), moved, rows=rows),
-                "after": unexplained_energy(begun, moved, rows=rows),
+                "before": unexplained_energy(initial_planes("random", target), target, rows=rows),
+                "after": unexplained_energy(initial, target, rows=rows),
             }
         return content
 
-    rows = PLANE_SETS[model.plane_set]  # A user's own may change under the same name.
+    rows = PLANE_SETS[model.plane_set]  # A user's own plane set may change without a new name.
     of_time = [config.dynamic, config.noise, model.plane_set, rows, model.time_resolution]
     of_time += [model.texels_of_time, seed]
     inputs = [parts.key, config.static, model.resolution, of_time if moving else []]

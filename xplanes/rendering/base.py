@@ -33,7 +33,7 @@ class Rendering:
 
     @property
     def shown(self) -> Tensor | None:
-        """Rays whose samples had slots and which count; None for all. bool [R]"""
+        """Whether the samples of each ray fitted the slots; None if all did. bool [R]"""
         return getattr(self.samples, "shown", None)
 
 

@@ -54,8 +54,8 @@ def behind(
             clear[:, None], background_colour(background, origins, directions, jitter, ends), 0
         )
     seen = clear.nonzero()[:, 0]
-    place = None if jitter is None else jitter[seen]
-    colour = background_colour(background, origins[seen], directions[seen], place, ends)
+    offset = None if jitter is None else jitter[seen]
+    colour = background_colour(background, origins[seen], directions[seen], offset, ends)
     black = torch.zeros_like(directions, dtype=colour.dtype)
     return black.index_put((seen,), colour)
 

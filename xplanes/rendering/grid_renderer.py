@@ -29,7 +29,7 @@ from xplanes.streams import Stream, TrainingState, counted_uniform, step_generat
 SPARE = 1.25
 """Memory slots for the samples of a batch, relative to their average number."""
 
-STEP_OF_ROOM = 1024
+SLOT_STEP = 1024
 """The number of slots is a multiple of this."""
 
 FEWEST_SAMPLES, SAMPLES_PER_PIXEL = 128, 0.5
@@ -357,7 +357,7 @@ class OccupancySampler(Sampler):
     Args:
         renderer: Its grid is changed in place.
         settings: Settings of the updates.
-        samples: Maximum average number of samples per batch; None if unknown.
+        most_samples: Maximum average number of samples per batch; None if unknown.
         fill_seconds: Seconds spent on filling the grid of an initialised field.
     """
 
@@ -365,25 +365,22 @@ class OccupancySampler(Sampler):
         self,
         renderer: GridRenderer,
         settings: OccupancySettings,
-        samples: int | None = None,
+        most_samples: int | None = None,
         fill_seconds: float = 0.0,
     ) -> None:
-        self.settings, self.grid, self.samples = settings, renderer.grid, samples
+        self.settings, self.grid, self.most_samples = settings, renderer.grid, most_samples
         self.fill_seconds = fill_seconds
-        self._along = renderer.samples
-        room = None if samples is None else self._room(samples)
         distorted = settings.distortion > 0
-        self._training = replace(
-            renderer, room=room, distorted=distorted, thinning=settings.thinning
-        )
-        self._images = replace(renderer, samples=settings.render_samples)
+        self._training_renderer = replace(renderer, distorted=distorted, thinning=settings.thinning)
+        self._image_renderer = replace(renderer, samples=settings.render_samples)
+        self.expect(math.inf)
 
     @property
     def renderer(self) -> GridRenderer:
-        images = self._images
-        if images.samples > self._along and self.grid.occupied_fraction > HALF_EMPTY:
-            return replace(images, samples=self._along)
-        return images
+        renderer, least = self._image_renderer, self._training_renderer.samples
+        if renderer.samples > least and self.grid.occupied_fraction > HALF_EMPTY:
+            return replace(renderer, samples=least)
+        return renderer
 
     @property
     def parts(self) -> dict[str, nn.Module]:
@@ -402,15 +399,15 @@ class OccupancySampler(Sampler):
         return min(most, 256)
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
-        training = self._training
+        renderer = self._training_renderer
         # On a GPU the number of slots would not follow when the number of samples doubles.
         on_cpu = self.device.type == "cpu"
         if on_cpu and self.settings.coarse_first and state.step < self.pruned_at:
-            training = replace(training, samples=max(1, training.samples // 2))
+            renderer = replace(renderer, samples=max(1, renderer.samples // 2))
         # On other devices the selection costs more than it saves.
         thins = self.settings.thinning > 0 and on_cpu
         thins = thins and torch.is_grad_enabled() and isinstance(field, nn.Module)
-        return training.render(
+        return renderer.render(
             field,
             rays["origins"],
             rays["directions"],
@@ -458,7 +455,7 @@ class OccupancySampler(Sampler):
         uniform = counted_uniform(state.seed, state.step, stream, (SPARSE_POINTS, 5), device)
         points, times = self.grid.occupied_points(uniform.float())
         density = field(points, times)[1]
-        opacity = -torch.expm1(-self._training.step * density)
+        opacity = -torch.expm1(-self._training_renderer.step * density)
         # Computed even if no cell is occupied: other processes wait for the gradients.
         return steps * self.settings.sparsity / SPARSE_POINTS * opacity.sum()
 
@@ -490,14 +487,14 @@ class OccupancySampler(Sampler):
                 distributed.broadcast(part, src=0)
 
     def expect(self, samples: float) -> None:
-        if self.samples is not None:
-            room = self._room(min(samples, self.samples))
-            self._training = replace(self._training, room=room)
-
-    def _room(self, samples: float) -> int:
-        """Slots for batches with this average number of samples; some batches have more."""
-        # At least one ray must fit; few different sizes allow memory to be reused.
-        return STEP_OF_ROOM * math.ceil(max(SPARE * samples, 2 * self._along) / STEP_OF_ROOM)
+        if self.most_samples is None:
+            return
+        # Some batches have more than the average, and at least one ray must fit; few different
+        # sizes allow memory to be reused.
+        training = self._training_renderer
+        slots = max(SPARE * min(samples, self.most_samples), 2 * training.samples)
+        room = SLOT_STEP * math.ceil(slots / SLOT_STEP)
+        self._training_renderer = replace(training, room=room)
 
     def scalars(self) -> dict[str, float]:
         return {"sampler/occupied": self.grid.occupied_fraction}

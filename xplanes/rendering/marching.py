@@ -18,8 +18,7 @@ from xplanes.rendering.occupancy import OccupancyGrid
 OUTSIDE = 3.0
 """Coordinate of unused slots, outside the planes: nothing is read or added there."""
 
-
-STEP_OF_TRIAL = 0.07
+TRIAL_STEP = 0.07
 """Distance between samples in the kernel's trial."""
 
 
@@ -54,7 +53,7 @@ class Samples:
         occluded: Samples dropped because an opaque surface lies in front.
         live: Whether each slot holds a sample; None unless the number of slots is fixed. [N]
         number: Number of slots that hold a sample; None if ``live`` is. []
-        shown: Rays whose samples fit the slots; None if ``live`` is. [R]
+        shown: Whether each ray's samples fit the slots; None if ``live`` is. bool [R]
 
     If the number of slots is fixed, the counts are tensors. Unused slots come last, with points
     outside the cube.
@@ -244,7 +243,7 @@ def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
     """Whether the kernel passes its trial on rays that enter, start inside and miss the cube."""
 
     def attempt(function: Callable[..., Samples], precision: torch.dtype) -> list[Tensor]:
-        grid = OccupancyGrid(6, 3, step=STEP_OF_TRIAL).to(device)
+        grid = OccupancyGrid(6, 3, step=TRIAL_STEP).to(device)
         grid.least.copy_(20 * waves(device, len(grid.least)).abs())
         origins = 2 * waves(device, 50, 3)
         ahead = 0.9 * waves(device, 57, 3)[7:] - origins
@@ -252,7 +251,7 @@ def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
         times, jitter = (numbers.clone() for numbers in waves(device, 2, 50).abs())
         rays = Rays(*(t.to(precision) for t in (origins, directions, times, jitter)))
         occupied = waves(device, len(grid.least)) > 0
-        found = function(rays, grid, step=STEP_OF_TRIAL, occupied=occupied, limit=3.0, room=400)
+        found = function(rays, grid, step=TRIAL_STEP, occupied=occupied, limit=3.0, room=400)
         assert found.live is not None
         here = found.live
         numbers = [found.candidates, found.empty, found.occluded, found.count]
@@ -278,19 +277,20 @@ def _march_cpu(
     near, far = ray_box(rays.origins, rays.directions)
     half = 0.5 * grid.resolution
     origins, directions = rays.origins.contiguous(), rays.directions.contiguous()
-    line = (origins, directions)
-    way = ((origins + 1) * half, directions * half, grid.bins(rays.times), near, rays.jitter)
-    line, way = (tuple(t.contiguous().numpy() for t in part) for part in (line, way))
+    field_rays = (origins.numpy(), directions.numpy())
+    grid_rays = ((origins + 1) * half, directions * half, grid.bins(rays.times), near, rays.jitter)
+    grid_rays = tuple(t.contiguous().numpy() for t in grid_rays)
     wanted = (grid.occupied if occupied is None else occupied).numpy()
     chosen = (wanted, grid.resolution, occupied is not None)
     counts = torch.empty(3, len(near), dtype=torch.int64)
-    cpu.count_samples(way, step, chosen, far.numpy(), grid.least.numpy(), limit, counts.numpy())
+    least = grid.least.numpy()
+    cpu.count_samples(grid_rays, step, chosen, far.numpy(), least, limit, counts.numpy())
     candidates, found, kept = counts.sum(dim=1).tolist()
     starts = counts[2].cumsum(0) - counts[2]
     ray, cells = torch.empty(2, kept, dtype=torch.int64)
     distances, points = origins.new_empty(kept), origins.new_empty(kept, 3)
     places = (starts, counts[2], ray, distances, cells, points)
-    cpu.fill_samples(line, way, step, chosen, tuple(t.numpy() for t in places))
+    cpu.fill_samples(field_rays, grid_rays, step, chosen, tuple(t.numpy() for t in places))
     return Samples(
         ray, starts, points, distances, cells, candidates, candidates - found, found - kept
     )

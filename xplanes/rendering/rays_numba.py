@@ -29,14 +29,14 @@ def cell_to_sample(r, distance, start, slope, bins, occupied, size, skip):
 
 
 @njit(exact=True, parallel=True)
-def count_samples(way, step, chosen, far, least, limit, counts):
+def count_samples(grid_rays, step, chosen, far, least, limit, counts):
     """Numbers of candidates, samples in occupied cells, and unoccluded samples of each ray.
 
-    ``way`` holds the first cell and the cells per distance of each ray [R, 3], its time bin, its
-    near end and its jitter. ``chosen`` tells which cells are occupied, how many lie along a side,
-    and whether empty ones are skipped.
+    ``grid_rays``: origin and direction of each ray in units of cells [R, 3], its time bin, entry
+    distance and jitter [R]. ``chosen``: which cells are occupied, their number along a side, and
+    whether empty ones are skipped.
     """
-    start, slope, bins, near, jitter = way
+    start, slope, bins, near, jitter = grid_rays
     occupied, size, skip = chosen
     for r in prange(len(near)):
         candidates, found, visible = 0, 0, 0
@@ -55,10 +55,10 @@ def count_samples(way, step, chosen, far, least, limit, counts):
 
 
 @njit(exact=True, parallel=True)
-def fill_samples(line, way, step, chosen, places):
-    """Place the samples that were counted; ``way`` and ``chosen`` as in `count_samples`."""
-    origins, directions = line
-    start, slope, bins, near, jitter = way
+def fill_samples(field_rays, grid_rays, step, chosen, places):
+    """Place the samples that were counted; ``grid_rays`` and ``chosen`` as in `count_samples`."""
+    origins, directions = field_rays
+    start, slope, bins, near, jitter = grid_rays
     occupied, size, skip = chosen
     starts, counts, ray, distances, cells, points = places
     for r in prange(len(near)):

@@ -289,16 +289,16 @@ class RayBatches(Batches):
         self._prefetched = -1
         self.near_pixels = textureless_pixels + others
         pixels = self.near_pixels + self.far_pixels
-        natural, textureless_natural = self.far_pixels / pixels, textureless_pixels / pixels
+        uniform_far, uniform_textureless = self.far_pixels / pixels, textureless_pixels / pixels
         skip = settings.skip_background and self.near_pixels > 0
         share = settings.background_share if changes is None else STATIC_SHARE
-        self.far_share = min(share, natural) if skip else natural
+        self.far_share = min(share, uniform_far) if skip else uniform_far
         self.textureless_share = (
-            min(TEXTURELESS_SHARE, textureless_natural) if skip else textureless_natural
+            min(TEXTURELESS_SHARE, uniform_textureless) if skip else uniform_textureless
         )
-        jitter = skip and natural > 0 and not views.is_static and changes is None
+        jitter = skip and uniform_far > 0 and not views.is_static and changes is None
         self.background_jitter = settings.background_jitter if jitter else 0.0
-        self.skipped = natural + textureless_natural - self.far_share - self.textureless_share
+        self.skipped = uniform_far + uniform_textureless - self.far_share - self.textureless_share
         self.pools.share(self.far_share, self.textureless_share)
 
     def add_slopes(self) -> None:
@@ -339,9 +339,9 @@ class RayBatches(Batches):
             count = 1 if self.background == "one" else rays
             background = torch.rand(count, 3, generator=generator).expand(rays, 3)
         move = torch.rand(rays, generator=generator) if self.background_jitter else None
-        return more | self._served(drawn, background, move, uniform[:rays, 2].float())
+        return more | self._batch_of(drawn, background, move, uniform[:rays, 2].float())
 
-    def _served(
+    def _batch_of(
         self, drawn: tuple[Tensor, ...], background: Tensor, move: Tensor | None, jitter: Tensor
     ) -> Batch:
         """The batch of drawn pixels on a background; ``move`` and ``jitter`` are from 0 to 1."""
@@ -484,7 +484,7 @@ class DeviceBatches(RayBatches):
         elif self.background == "white":
             background = torch.ones_like(background)
         move = uniform[:, 6].float() if self.background_jitter else None
-        return more | self._served(drawn, background, move, uniform[:, 2].float())
+        return more | self._batch_of(drawn, background, move, uniform[:, 2].float())
 
 
 def _per_run(rays: int) -> int:

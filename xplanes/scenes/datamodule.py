@@ -70,7 +70,7 @@ class SceneDataModule(LightningDataModule):
         self.seed = seed
         if not isinstance(scene, _GivenScene):
             self.save_hyperparameters({"scene": self.settings.plain(), "seed": seed})
-        self.first = 0
+        self.drawn = 0
         """Number of batches already drawn."""
         self.holds_out = True
         """Whether training views may be held out for scores."""
@@ -168,7 +168,7 @@ class SceneDataModule(LightningDataModule):
         """Read the splits that a stage needs: ``fit``, ``validate``, ``test`` or ``predict``."""
         if stage == "fit":
             # Each module continues its own count of batches.
-            self.first = getattr(self._module, "batches", self.first)
+            self.drawn = getattr(self._module, "batches", self.drawn)
         scores = self.trainer is None or self.trainer.limit_val_batches
         if stage in ("fit", "validate"):
             if (split := self.validation_split) is None:
@@ -281,10 +281,10 @@ class SceneDataModule(LightningDataModule):
         return DataLoader(dataset, batch_size=None, sampler=sampler)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"batches": getattr(self._module, "batches", self.first)}
+        return {"batches": getattr(self._module, "batches", self.drawn)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.first = state_dict["batches"]
+        self.drawn = state_dict["batches"]
 
 
 class _Endless(IterableDataset):
@@ -299,8 +299,8 @@ class _Endless(IterableDataset):
 
     def __iter__(self) -> Iterator[Batch]:
         while True:
-            step = self.data.first
-            self.data.first += 1
+            step = self.data.drawn
+            self.data.drawn += 1
             yield self.batches.draw(step, self.data.rays, self.data.errors)
 
 

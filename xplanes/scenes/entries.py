@@ -55,10 +55,10 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
     """The file that ``name`` refers to inside ``folder``.
 
     The suffix may be missing or that of another format, and the name may differ in case or in the
-    encoding of accents, as long as only one file matches; it may be percent-encoded. If a path does
-    not exist, such as one of another machine, its first folders are dropped; in a relative name,
-    not that of a split, nor any if its own folder exists. What is then left without folders is also
-    tried in images.
+    encoding of accents, as long as only one file matches; it may be percent-encoded. If there is no
+    such path, its first folders are dropped one by one, as it may be a path of another machine.
+    Relative names keep the folder of a split, and all folders if the last one exists. A name
+    without folders is also looked up in the folder ``images``.
 
     Args:
         label: The file and frame that name it, for messages.
@@ -401,8 +401,8 @@ def world_turn(
             "are stored, and up vectors follow EXIF",
             *(turned_photos, len(paths)),
         )
-    aside = torch.tensor([UP.get(tag, (0, 1)) for tag in tags], dtype=torch.float64)
-    up = (poses[:, :3, :2].double() * aside[:, None]).sum(dim=2)
+    image_up = torch.tensor([UP.get(tag, (0, 1)) for tag in tags], dtype=torch.float64)
+    up = (poses[:, :3, :2].double() * image_up[:, None]).sum(dim=2)
     if (rotation := upright(up)) is None:
         if orient:
             warn(

@@ -27,7 +27,7 @@ START = 300
 """Batches before pixels are preferred: errors are large everywhere at first."""
 
 LEAST = 0.02
-"""Least error of a tile, relative to the mean: errors of dark tiles are underestimated."""
+"""Share of the mean squared error that is added to that of each tile, so that none is ignored."""
 
 
 @dataclass(frozen=True)

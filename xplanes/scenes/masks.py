@@ -113,8 +113,8 @@ def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
     for path in files:
         grey, lossy = _stored(path)
         # Labels need exact values, which lossy formats do not preserve.
-        may_be = not lossy and _has_regions(grey)
-        numbers |= set(np.unique(grey).tolist()) if may_be else {1}
+        may_be_labels = not lossy and _has_regions(grey)
+        numbers |= set(np.unique(grey).tolist()) if may_be_labels else {1}
         stride = -(-max(grey.shape) // LOOK)
         stored.append(grey[::stride, ::stride])
     labels = len(numbers) <= MOST_LABELS and max(numbers, default=0) <= WHITE and 0 in numbers

@@ -92,7 +92,10 @@ class PixelPools:
         return moved
 
     def pick(self, kind: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
-        """Draw pixels by uniform numbers: whether each is far, its index. [R] -> bool, int64 [R]"""
+        """Draw pixels: whether each is far, its index. [R], [R] -> bool, int64 [R]
+
+        ``kind`` and ``where`` are uniform numbers that choose the kind and the position in it.
+        """
         kind = torch.bucketize(kind.contiguous(), self.bounds, right=True)
         place = torch.addcmul(self.starts[kind], where, self.counts[kind]).long()
         place.clamp_(max=self.total - 1)
@@ -161,7 +164,7 @@ class RunPools:
         self.far_share = far
 
     def pick(self, kind: Tensor, where: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Draw runs by uniform numbers: whether each is far, its view, its index there. [K] each"""
+        """As `PixelPools.pick`, for runs: whether each is far, its view, its index there. [K]"""
         far, total, (size, _, rest) = kind < self.far_share, int(self.first[-1]), self.sizes
         place = torch.where(far, where * size, size + where * rest).long()
         place = place.clamp_(max=size + rest - 1)

@@ -80,7 +80,7 @@ class PixelFile:
         self.source, self.key, self.sizes, self.channels = source, key, tuple(sizes), channels
         self.first = _firsts(sizes)
         self._file = source.open("rb", buffering=0) if isinstance(source, Path) else None
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
 
     def __reduce__(self) -> Any:
         return PixelFile, (self.source, self.key, self.sizes, self.channels)
@@ -116,7 +116,7 @@ class PixelFile:
         if hasattr(os, "pread"):  # Forked processes share the position in the file.
             content = os.pread(self._file.fileno(), length, offset)
         else:
-            with self._turn:
+            with self._lock:
                 self._file.seek(offset)
                 content = self._file.read(length)
         if len(content) < length:
@@ -357,7 +357,7 @@ def _write(path: Path, sizes: Sequence[Size], channels: int, jobs: Sequence[Job]
     """Decode all images to a file, with one image per thread in memory."""
     from tqdm import tqdm
 
-    first, turn = _firsts(sizes), threading.Lock()
+    first, lock = _firsts(sizes), threading.Lock()
     with (
         path.open("r+b", buffering=0) as file,
         tqdm(
@@ -374,7 +374,7 @@ def _write(path: Path, sizes: Sequence[Size], channels: int, jobs: Sequence[Job]
             assert pixels.shape[:2] == sizes[index]
             for offset, part in _parts(first, channels, index, pixels):
                 content = part.data
-                with turn:
+                with lock:
                     file.seek(offset)
                     # One call may write only a part, at most 2 GB on Linux.
                     while len(content):

@@ -131,7 +131,7 @@ def readable(paths: Sequence[Path]) -> dict[Path, dict[str, Any]]:
 def time_span(contents: Iterable[Mapping[str, Any]]) -> tuple[float, float] | None:
     """First and last time in several transforms files; None if no frame has a time."""
     entries = [entry for content in contents for entry in content["frames"]]
-    times = [entry[key] for entry in entries if is_number(entry.get(key := _key([entry])))]
+    times = [entry[key] for entry in entries if is_number(entry.get(key := _time_key([entry])))]
     return (min(times), max(times)) if times else None
 
 
@@ -218,7 +218,7 @@ def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame
     A frame that is listed again, equal in all its keys, is left out, too.
     """
     entries = content["frames"]
-    key = _key(entries)
+    key = _time_key(entries)
     timed = sum(entry.get(key) is not None for entry in entries)
     smaller: list[Path] = []
     listed: dict[str, int] = {}
@@ -506,7 +506,7 @@ def stated_up(content: Mapping[str, Any], orient: bool | None) -> tuple[bool | N
     return orient, None
 
 
-def _key(entries: Sequence[Mapping[str, Any]]) -> str:
+def _time_key(entries: Sequence[Mapping[str, Any]]) -> str:
     given = (key for key in TIMES if any(entry.get(key) is not None for entry in entries))
     return next(given, TIMES[0])
 
@@ -515,7 +515,7 @@ def _times(
     path: Path, frames: Sequence[_Frame], span: tuple[float, float] | None
 ) -> tuple[list[float], str]:
     """Times of all frames, and their source; empty if no frame has a time."""
-    key = _key([frame.entry for frame in frames])
+    key = _time_key([frame.entry for frame in frames])
     if frames[0].entry.get(key) is None:
         return [], ""
     times = [checked_number(frame.label, key, frame.entry[key]) for frame in frames]

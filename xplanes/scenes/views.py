@@ -325,8 +325,8 @@ class Views:
         columns = torch.arange(self.width) < width[:, None]
         found = rows[:, :, None] & columns[:, None, :]
         for index in range(len(self)):
-            if (has_ray := self.shown(index)) is not None:
-                found[index, : has_ray.shape[0], : has_ray.shape[1]] &= has_ray
+            if (shown := self.shown(index)) is not None:
+                found[index, : shown.shape[0], : shown.shape[1]] &= shown
         return found
 
     def to(self, device: torch.device) -> "Views":
@@ -368,9 +368,9 @@ class Views:
 
     def edge_share_of(self, index: int, colour: Tensor) -> float:
         """Share of the pixels at the edge of image ``index`` that are close to a colour [3]."""
-        image, has_ray = self.image(index), self.shown(index)
+        image, shown = self.image(index), self.shown(index)
         pale = (image[..., :3].short() - (255 * colour).short()).abs().amax(dim=-1) < PALE_STEPS
-        edge = torch.ones_like(pale) if has_ray is None else has_ray.clone()
+        edge = torch.ones_like(pale) if shown is None else shown.clone()
         height, width = pale.shape
         rim = max(1, round(RIM * min(height, width)))
         edge[rim : height - rim, rim : width - rim] = False
@@ -384,7 +384,7 @@ class Views:
         return PosedCamera(self.camera_to_world[index], focal, height, width, centre, lens)
 
     def image_rays(self, index: int) -> tuple[Tensor, Tensor]:
-        """Rays through every pixel of image ``index``, row by row. [h w, 3], [h w, 3]
+        """Rays through every pixel of image ``index``, row by row.
 
         Returns:
             Origins and unit directions in the world. [h w, 3], [h w, 3]

@@ -169,7 +169,7 @@ def texel_findings(
         finer = 2 ** round(math.log2(resolution * per_texel / (0.5 * COARSE)))
         more = f"Planes with {finer} texels per side would show it"
         if fine:
-            more = f"model.fine.texels={finer} adds finer planes, which pay after two minutes"
+            more = f"model.fine.texels={finer} adds finer planes, which help after two minutes"
         yield Finding(
             "texels",
             f"a texel of planes with {resolution} texels per side covers {per_texel:.0f} pixels of "

@@ -36,7 +36,7 @@ OWN = "own"
 """Value of ``--time`` for the time of the view that ``--path`` names."""
 
 PATHS = ("auto", "orbit", "fixed", "cameras")
-"""Values of ``--path`` that are no names of views or files."""
+"""Values of ``--path`` other than names of views or files."""
 
 LARGEST = 8192
 """Most pixels per side; WebP allows twice as many."""

@@ -27,8 +27,8 @@ from xplanes.scenes.frame import cube_frame
 from xplanes.scenes.images import load_images
 from xplanes.streams import Stream, step_generator
 
-FRAMES, FPS, SIDE = 48, 16, 224
-SAMPLES, CELLS = 192, 64
+FRAMES, FPS, SIDE = 48, 16, 224  # Of the video; pixels per side.
+SAMPLES, CELLS = 192, 64  # Steps along the diagonal; cells of the grid per side.
 
 
 def write_triplanes(paths: Sequence[Path], out: Path, experiment: Experiment) -> Path:

@@ -248,7 +248,7 @@ class Estimate(NamedTuple):
         first_ray: Seconds per ray of an image of the untrained field.
         later_ray: Seconds per ray once surfaces are opaque and empty space is pruned.
         pruned_at: First step at which empty space is pruned.
-        passing: Share of the extra time of an untrained field that remains once it is.
+        passing: Share of the extra time of an untrained field that remains after that step.
     """
 
     step: float

@@ -67,7 +67,7 @@ class RadianceModule(LightningModule):
     ``RadianceModule.load_from_checkpoint(path)`` needs only the file (and ``plugins``, if used).
 
     A step is `training_step` (render the rays, sum the loss terms), `on_before_optimizer_step`
-    (gradients of regularisers without rays; a step that is not finite is skipped) and
+    (gradients of regularisers without rays; non-finite updates are skipped) and
     `optimizer_step` (the optimiser, then the update of the occupancy grid). Validation and test
     score whole views, as `SceneDataModule` serves them.
 
@@ -83,15 +83,15 @@ class RadianceModule(LightningModule):
 
     def __init__(self, config: Mapping[str, Any] | Method, plugins: Sequence[str] = ()) -> None:
         super().__init__()
-        read = isinstance(config, Method)
-        self.method = config if read else _read(config, plugins)
-        plain = config.plain() if read else config
+        parsed = isinstance(config, Method)
+        self.method = config if parsed else _read(config, plugins)
+        plain = config.plain() if parsed else config
         # Without plug-ins: a file from somebody else must not choose what is imported.
         kept = {name: plain[name] for name in Method.GROUPS if name in plain}
         self.save_hyperparameters({"config": kept})
         self._plugins = tuple(plugins)
         self.ray_settings: BatchSettings = self.method.model.rays
-        """Sizes of training batches; adapted to the device once the field is built."""
+        """Settings of training batches; auto is resolved once the device is known."""
         self.batches = 0
         """Number of batches drawn so far."""
         self.rays = 0

@@ -120,8 +120,8 @@ class Posed:
         reached = block.hit(origins - 0.5 * (low + high), directions).isfinite()
         chunk = CHUNK if all(part.shape.quick for part in self.parts) else 6 * CHUNK
         for rays in reached.nonzero()[:, 0].split(chunk):
-            for whole, chunk in zip(hits, self._cast(origins[rays], directions[rays]), strict=True):
-                whole[rays] = chunk
+            for whole, found in zip(hits, self._cast(origins[rays], directions[rays]), strict=True):
+                whole[rays] = found
         return hits
 
     def render(self, origins: Tensor, directions: Tensor) -> Tensor:

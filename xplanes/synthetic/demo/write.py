@@ -21,6 +21,7 @@ from torch import Tensor
 
 from xplanes.backend import threads
 from xplanes.errors import ConfigError, SceneError
+from xplanes.files import DAY
 from xplanes.scenes.dnerf import read_scene
 from xplanes.scenes.images import load_images
 from xplanes.scenes.source import SceneSettings
@@ -51,9 +52,6 @@ USUAL_VIEWS = {"train": 50, "val": 10, "test": 12}
 
 VIDEO_FRAMES = 50
 """Frames of the fixed-camera video."""
-
-DAY = 86_400.0
-"""Age in seconds from which an unfinished folder counts as abandoned."""
 
 _RENDERING = threading.Lock()
 

@@ -65,6 +65,7 @@ class PretrainingModule(LightningModule):
         self.model, self.average = model, copy.deepcopy(model).requires_grad_(False)
         self.batch, self.schedule, self.seed, self.bf16 = batch, schedule, seed, bf16
         self.camera = canonical_vector(model.view)
+        # Steps done, seconds of training, and consecutive steps that were skipped.
         self.steps, self.clock, self.unusable = 0, 0.0, 0
         self.last: dict[str, float | Tensor] = {}
 

@@ -18,9 +18,8 @@ from xplanes.backend import compiled
 from xplanes.errors import ConfigError
 from xplanes.files import read_json, replacing, write_json
 from xplanes.lrm.canonical import CanonicalView
-from xplanes.scenes.cameras import look_at
 from xplanes.streams import Stream, step_generator
-from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE
+from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE, camera_at
 from xplanes.synthetic.pretraining.objects import procedural_object
 from xplanes.synthetic.pretraining.solids import Array, Solids
 
@@ -32,10 +31,7 @@ FOCAL = 0.5 / math.tan(0.5 * CAMERA_ANGLE_X)
 
 def camera(azimuth: float, elevation: float) -> Array:
     """Pose of a camera that faces the origin, at D-NeRF's distance; degrees. [4, 4]"""
-    turn, rise = math.radians(azimuth), math.radians(elevation)
-    flat = math.cos(rise)
-    place = [flat * math.cos(turn), flat * math.sin(turn), math.sin(rise)]
-    return look_at(CAMERA_DISTANCE * torch.tensor([place], dtype=torch.float64))[0].numpy()
+    return camera_at(azimuth, elevation).numpy()
 
 
 def render_solids(

@@ -143,7 +143,7 @@ def test_lenses_shrink_with_images(capture):
         assert [named[name] for name in ("k1", "k2", "p1", "p2")] == list(OPENCV[4:])
 
 
-def test_points(capture):
+def test_points_tell_how_well_the_cameras_fit(capture):
     scene = capture.read("train")
     assert scene.points.tolist() == torch.tensor(POINTS).tolist()
     assert scene.notes["points"] == "2, 0.50 px from where images show them on average"
@@ -151,10 +151,7 @@ def test_points(capture):
     scene = capture.read("train")
     assert scene.points is None
     assert "points" not in scene.notes
-
-
-def test_cameras_that_fit_badly_are_worth_refining(capture):
-    """Two points with errors of 1 and 2 pixels, and one whose error COLMAP does not know."""
+    # Two points with errors of 1 and 2 pixels, and one whose error COLMAP does not know.
     capture.write(text=True)
     for path in (capture.path / "sparse/0").glob("*.bin"):
         path.unlink()

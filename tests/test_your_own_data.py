@@ -4,26 +4,30 @@ import itertools
 import json
 import re
 import shlex
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
-from tests.balls import ball_views, swinging
-from tests.captures import NerfiesFolder, save, write_colmap, write_rows
+from tests.captures import NerfiesFolder, save, write_rows
+from tests.scenes.test_formats_agree import (
+    FOCAL,
+    FRAMES,
+    NAMES,
+    POSES,
+    SIZE,
+    before_noise,
+    blender,
+    colmap,
+    nerfstudio,
+)
 from tests.training.runs import SMALL, changed
 from xplanes.cli import main
 from xplanes.config import compose_plain
 from xplanes.scenes.datamodule import SceneDataModule
-from xplanes.scenes.views import Views
-from xplanes.synthetic.demo.write import ensure_demo_scene
 from xplanes.tools import inspect
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "your_own_data.md"
-SIZE = 40
-CAMERAS, FRAMES = 4, 4
 
 
 def commands(program: str) -> list[list[str]]:
@@ -32,87 +36,33 @@ def commands(program: str) -> list[list[str]]:
     return [shlex.split(line) for line in lines]
 
 
-def ball(count: int, **options: Any) -> Views:
-    return ball_views(count, 0.6, centre=swinging(0.3, 1), size=SIZE, **options)
-
-
-def save_all(folder: Path, names: Iterable[str], views: Views) -> None:
-    """Write images before a wall of grey noise, without alpha."""
-    for index, name in enumerate(names):
-        image = views.image(index)
-        noise = torch.randint(40, 200, image.shape, dtype=torch.uint8)
-        save(folder / name, torch.where(image[..., 3:] > 0, image, noise)[..., :3].numpy())
-
-
-def focal_of(views: Views) -> float:
-    return float(views.intrinsics.focal[0, 0])
-
-
-def write_dancer(folder: Path) -> None:
-    """A COLMAP model with masks and times."""
-    views, names = ball(16), [f"frame_{number:04d}.jpg" for number in range(16)]
-    save_all(folder / "images", names, views)
-    for index, name in enumerate(names):
-        save(folder / "masks" / f"{name}.png", views.image(index)[..., 3].numpy())
-    lens = (focal_of(views), focal_of(views), SIZE / 2, SIZE / 2, -0.02, 0.0, 0.0, 0.0)
-    poses = views.camera_to_world.double().numpy()
-    images = [(name, pose, 1, 2) for name, pose in zip(names, poses, strict=True)]
-    camera = {1: ("OPENCV", SIZE, SIZE, lens)}
-    write_colmap(folder / "sparse" / "0", camera, images, [[0.1, 0.2, 0.3]])
-    rows = [f"{name},{index / 10}" for index, name in enumerate(names)]
-    (folder / "times.csv").write_text("\n".join(["file,time", *rows]) + "\n")
-
-
-def write_transforms(folder: Path, names: list[str], views: Views, **content: Any) -> None:
-    """nerfstudio's transforms.json."""
-    frames = [
-        {"file_path": name, "transform_matrix": pose, "time": index / 30}
-        for index, (name, pose) in enumerate(
-            zip(names, views.camera_to_world.tolist(), strict=True)
-        )
-    ]
-    content |= {"fl_x": focal_of(views), "w": SIZE, "h": SIZE, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(content))
-
-
-def write_moving(folder: Path, first: int, ending: str, **content: Any) -> None:
-    """Images of one moving camera, numbered from ``first``."""
-    views = ball(16)
-    names = [f"images/image{first + index:06d}.{ending}" for index in range(16)]
-    save_all(folder, names, views)
-    write_transforms(folder, names, views, **content)
-
-
-def write_cameras(folder: Path, camera_name: str, ending: str) -> Views:
-    """A folder of images for each camera, whose first views are returned."""
-    firsts, times = ball(CAMERAS), torch.linspace(0, 1, FRAMES)
-    for camera, pose in enumerate(firsts.camera_to_world):
-        views = ball(FRAMES, poses=pose.repeat(FRAMES, 1, 1), times=times)
-        names = [f"{index:04d}.{ending}" for index in range(FRAMES)]
-        save_all(folder / camera_name.format(camera), names, views)
-    return firsts
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the page's reader works."""
+    """Where the page's reader works: a small capture of four cameras in every format."""
     root = tmp_path_factory.mktemp("work")
     captures = root / "captures"
-    write_dancer(captures / "dancer")
-    write_moving(captures / "statue", 0, "png", camera_model="OPENCV", k1=0.01)
-    write_moving(captures / "hand", 50, "jpg")
-    firsts = write_cameras(captures / "fly", "cam{}", "jpg")
-    write_transforms(captures / "fly", [f"cam{k}/0000.jpg" for k in range(CAMERAS)], firsts)
-    firsts = write_cameras(captures / "kitchen", "cam{:02d}", "png")
-    names = [f"images/IMG_{index:04d}.png" for index in range(10)]
-    save_all(captures / "fern", names, ball(10))
-    for name, views in (("kitchen", firsts), ("fern", ball(10))):
-        poses = views.camera_to_world.double()
-        write_rows(captures / name, poses, SIZE, SIZE, focal_of(views))
+    for name in ("dancer", "statue", "hand", "excavator", "fly", "kitchen", "fern"):
+        (captures / name).mkdir(parents=True)
+    colmap(captures / "dancer", text=False)
+    rows = [f"{name}.png,{index / 10}" for index, name in enumerate(NAMES)]
+    (captures / "dancer/times.csv").write_text("\n".join(["file,time", *rows]) + "\n")
+    nerfstudio(captures / "statue")
+    nerfstudio(captures / "hand")
+    blender(captures / "excavator")
     NerfiesFolder(captures / "broom", 10)
-    counts = {"train_views": 5, "val_views": 1, "test_views": 1}
-    demo = ensure_demo_scene(root / "demo", "balls", resolution=16, **counts)
-    demo.rename(captures / "excavator")
+    for index in range(len(NAMES)):
+        camera, frame = divmod(index, FRAMES)
+        for start in (f"fly/cam{camera}/", f"kitchen/cam{camera:02d}/", f"fern/images/{camera}_"):
+            save(captures / f"{start}{frame:04d}.png", before_noise(index))
+    firsts = POSES[::FRAMES]
+    for folder, poses in (("kitchen", firsts), ("fern", POSES)):
+        write_rows(captures / folder, poses, SIZE, SIZE, FOCAL)
+    frames = [
+        {"file_path": f"cam{camera}/0000.png", "transform_matrix": pose.tolist()}
+        for camera, pose in enumerate(firsts)
+    ]
+    content = {"fl_x": FOCAL, "w": SIZE, "h": SIZE, "frames": frames}
+    (captures / "fly/transforms.json").write_text(json.dumps(content))
     return root
 
 

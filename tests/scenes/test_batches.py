@@ -41,16 +41,6 @@ def test_a_batch_depends_on_its_step_alone(background):
     assert torch.equal(torch.get_rng_state(), state), "other numbers are drawn"
 
 
-def test_steps_ranks_and_seeds_draw_different_rays():
-    drawn = [
-        batches_of(seed=seed, rank=rank).draw(step)
-        for seed, rank, step in itertools.product((0, 1, 2), (0, 1), (0, 1, 2))
-    ]
-    for first, second in itertools.combinations(drawn, 2):
-        assert not torch.equal(first["jitter"], second["jitter"])
-        assert not torch.equal(first["directions"], second["directions"])
-
-
 def test_neighbouring_generators_share_nothing():
     keys = [
         step_generator(seed, step, stream).initial_seed()

@@ -18,8 +18,8 @@ import torch
 
 from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings, write_colmap
 from tests.scenes.common import refused, told
+from tests.training.runs import changed
 from xplanes.components import build
-from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError
 from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.colmap import ColmapSettings
@@ -439,7 +439,7 @@ def test_one_camera_and_time_twice(capture):
 
 
 def test_folders_of_cameras_may_be_numbers():
-    plain = compose_plain("train", ["data=colmap", "data.test_cameras=[1,2]"])
+    plain = changed((), "data=colmap", "data.test_cameras=[1,2]")
     assert build(plain["data"], SceneSettings, "data").test_cameras == ["1", "2"]
 
 

@@ -14,8 +14,8 @@ from PIL import Image
 
 from tests.captures import save, settings
 from tests.scenes.common import ANGLE, SceneFolder, pose, refused, rgba, told
+from tests.training.runs import changed
 from xplanes.components import build
-from xplanes.config import compose_plain
 from xplanes.errors import MissingSplitError
 from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.dnerf import BlenderSettings
@@ -241,7 +241,7 @@ def test_a_split_that_was_not_rendered_is_left_out(scene, kind):
     for split in ("test", "val"):
         scene.add(split, 0 if kind == "no frames" else 5)
         shutil.rmtree(scene.path / split, ignore_errors=True)
-    config = compose_plain("train", ["data=blender", f"data.root={scene.path.parent}"])
+    config = changed((), "data=blender", f"data.root={scene.path.parent}")
     given = {**config["data"], "scene": scene.path.name, "resolution": None}
     with pytest.warns(UserWarning, match="The (test|val) split is left out"):
         splits = build(given, SceneSettings, "data").read().splits

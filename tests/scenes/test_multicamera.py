@@ -17,8 +17,8 @@ import torch
 from tests.balls import ball_views, surrounding, swinging
 from tests.captures import save, settings, write_colmap, write_rows
 from tests.scenes.common import assert_same_rays, refused, told
+from tests.training.runs import changed
 from xplanes.components import build
-from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.optional import MissingExtraError
 from xplanes.scenes import store
@@ -169,7 +169,13 @@ def test_videos_of_neural_3d_video(videos):
 
 
 def test_folders_of_images_keep_every_pixel(images):
+    for name in ("camera_paths", "mv_images/00000", "mv_images/00001"):  # Which are no cameras.
+        write_images(images / name, rgb(0)[:1])
+    (images / "camera_path.mp4").write_bytes(b"")
     require_all(read(images))
+    for name in ("camera_paths", "mv_images"):
+        shutil.rmtree(images / name)
+    (images / "camera_path.mp4").unlink()
     (images / "poses_bounds.npy").unlink()
     for name in ("cam{:02d}", "./cam{:02d}/5.png", "cam{:02d}\\5"):
         with_transforms(images, name)
@@ -374,7 +380,7 @@ def test_large_captures_are_kept_on_disk(videos, copied, tmp_path, monkeypatch, 
 
 def test_settings_of_the_command_line(videos):
     place = [f"data.root={videos.parent}", f"data.scene={videos.name}", "data.resolution=null"]
-    plain = compose_plain("train", ["data=multicamera", *place, "data.frames=[0,2,1]"])
+    plain = changed((), "data=multicamera", *place, "data.frames=[0,2,1]")
     settings = build(plain["data"], SceneSettings, "data")
     scene = settings.read()
     assert set(scene.splits) == {"train", "test"}
@@ -478,13 +484,6 @@ def test_images_that_are_missing_beside_videos(images):
     shutil.rmtree(images / "cam03")
     (images / "cam02" / "7.png").unlink()
     refuse(images, r"numbers of cam00/7\.png, cam01/7\.png\. Add what is")
-
-
-def test_folders_beside_cameras_are_none(images):
-    for name in ("camera_paths", "mv_images/00000", "mv_images/00001"):
-        write_images(images / name, rgb(0)[:1])
-    (images / "camera_path.mp4").write_bytes(b"")
-    require_all(read(images))
 
 
 def test_damaged_and_missing_videos_are_named(copied):

@@ -162,13 +162,15 @@ def test_lists_of_file_names_are_the_splits(capture):
     [
         # Nanoseconds since 1970, which single precision cannot tell apart.
         ("time", 17 * 10**17, 33_000_000, "1700000000000000000 to 1700000000297000000"),
-        ("timestamp", 1_700_000_000.25, 0.125, "1700000000.25 to 1700000001.375: "),
+        ("timestamp", 1_700_000_000.25, 0.125, "1700000000.25 to 1700000001.375"),
     ],
 )
-def test_times_in_any_unit_are_mapped_over_all_frames(capture, key, first, step, source):
+def test_times_in_any_unit_are_mapped_over_all_frames(capture, caplog, key, first, step, source):
     capture.timed([first + step * i for i in range(10)], key)
-    scene = capture.read(("train", "val"))
-    assert f'"{key}" of transforms.json, from {source}' in scene.notes["times"]
+    with caplog.at_level(logging.INFO, logger="xplanes"):
+        scene = capture.read(("train", "val"))
+    assert f"{key} from {source} is mapped to times from 0 to 1" in caplog.text
+    assert f'"{key}" of transforms.json, from {source}: ' in scene.notes["times"]
     for views in scene.splits.values():
         expected = [number / 9 for number in numbers(views)]
         assert views.times.tolist() == pytest.approx(expected, abs=1e-6)
@@ -608,8 +610,7 @@ def test_intrinsics_as_programs_write_them(capture, place, keys, expected, words
 def test_lenses_of_unknown_names_are_told_of(capture, name):
     capture.change(camera_model=name, k1=0.01)
     with told(f"camera_model='{str(name).upper()}' is not known"):
-        lens = capture.train().intrinsics.lens(0)
-    assert float(lens.coefficients[0, 0]) == 0.01
+        assert float(capture.train().intrinsics.lenses.coefficients[0, 0]) == 0.01
 
 
 @pytest.mark.parametrize(

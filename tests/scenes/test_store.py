@@ -300,10 +300,14 @@ def test_drawing_takes_no_memory_of_the_images(tmp_path, small, cache, capsys):
 
 def test_the_cache_is_used_again_until_a_source_changes(tmp_path, paths, cache, capsys):
     first = read_images(paths, cache=cache)[0]
-    assert "decoding" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "decoding" in said
+    assert "without use" not in said, "a cache that is named is the user's to clean"
     again = read_images(paths, cache=cache)[0]
     assert not capsys.readouterr().out
     assert again.identity == first.identity
+    (old,) = cache.glob("*.pixels")
+    os.utime(old, (0, 0))
     save(paths[1], np.full((65, 65, 3), 9, np.uint8))
     changed = read_images(paths, cache=cache)[0]
     assert (changed.image(1)[..., :3] == 9).all()
@@ -386,15 +390,6 @@ def test_what_no_run_has_used_for_a_month_is_removed(paths, users_cache, capsys)
     assert torch.equal(read_images(paths[:1])[0].image(0), expected)
 
 
-def test_a_cache_that_is_named_is_the_users_to_clean(paths, cache, capsys):
-    read_images(paths[:1], cache=cache)
-    assert "without use" not in capsys.readouterr().out
-    (old,) = cache.glob("*.pixels")
-    os.utime(old, (0, 0))
-    read_images(paths[1:], cache=cache)
-    assert old.exists()
-
-
 def test_an_interrupted_decoder_stops_soon(tmp_path, small, cache):
     source = tmp_path / "source"
     source.write_bytes(b"")
@@ -417,24 +412,19 @@ def test_an_interrupted_decoder_stops_soon(tmp_path, small, cache):
     assert time.monotonic() - began < 1.5
 
 
-def refuse(*_: object, **__: object) -> None:
-    raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+def test_a_cache_that_cannot_be_written_is_read_or_named(paths, cache, monkeypatch):
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
 
-def test_files_on_a_read_only_disk_are_read(paths, cache, monkeypatch):
     first = read_images(paths, cache=cache)[0]
-    monkeypatch.setattr(os, "utime", refuse)
+    assert isinstance(first, StoredImages)
+    monkeypatch.setattr(os, "utime", refuse)  # As on a read-only disk.
     again = read_images(paths, cache=cache)[0]
     assert isinstance(again, StoredImages)
-    assert isinstance(first, StoredImages)
     assert torch.equal(again.image(1), first.image(1))
-
-
-def homeless() -> Path:
-    raise RuntimeError("Could not determine home directory.")
-
-
-def test_a_cache_that_cannot_be_written_is_named(paths, cache, monkeypatch):
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     for home in (lambda: paths[0], homeless):
         monkeypatch.setattr(Path, "home", home)

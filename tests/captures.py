@@ -107,6 +107,15 @@ def write_colmap(folder, cameras, images, points=(), *, text=False):
     (folder / "points3D.bin").write_bytes(data)
 
 
+def write_rows(folder, poses, height, width, focal):
+    """LLFF's file: a row of each pose, of the size and focal length of its images, near and far."""
+    rows = []
+    for right, up, back, place in (pose[:3].T for pose in np.asarray(poses)):
+        matrix = np.stack([-up, right, back, place, [height, width, focal]], axis=1)
+        rows.append([*matrix.ravel(), 1.0, 9.0])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+
+
 class NerfiesFolder:
     """A capture with distorted images whose files can be changed before it is read."""
 

@@ -2,8 +2,6 @@
 
 import math
 
-MODELS = ("perspective", "fisheye", "fov", "polynomial")
-
 
 def distort(model, x, y, k):
     """A point of the plane, tan(theta) or theta from its middle, as the lens moves it."""

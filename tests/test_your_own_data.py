@@ -9,21 +9,27 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from PIL import Image
 
-from tests.balls import ball_views, swinging
-from tests.captures import NerfiesFolder, write_colmap
-from tests.training.runs import SMALL
+from tests.captures import NerfiesFolder, save, write_rows
+from tests.scenes.test_formats_agree import (
+    CAMERAS,
+    FOCAL,
+    FRAMES,
+    NAMES,
+    POSES,
+    SIZE,
+    before_noise,
+    blender,
+    colmap,
+    nerfstudio,
+)
+from tests.training.runs import SMALL, changed
 from xplanes.cli import main
 from xplanes.config import compose_plain
 from xplanes.scenes.datamodule import SceneDataModule
-from xplanes.scenes.views import Views
-from xplanes.synthetic.demo.write import ensure_demo_scene
+from xplanes.tools import inspect
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "your_own_data.md"
-SIZE = 40
-CAMERAS, FRAMES = 4, 4
 
 
 def commands(program: str) -> list[list[str]]:
@@ -32,111 +38,42 @@ def commands(program: str) -> list[list[str]]:
     return [shlex.split(line) for line in lines]
 
 
-def ball(count: int, **options: Any) -> Views:
-    return ball_views(count, 0.6, centre=swinging(0.3, 1), size=SIZE, **options)
-
-
-def save(path: Path, image: torch.Tensor) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(image.numpy()).save(path)
-
-
-def opaque(image: torch.Tensor) -> torch.Tensor:
-    """An image before a wall of grey noise. uint8 [h, w, 3]"""
-    noise = torch.randint(40, 200, image.shape, dtype=torch.uint8)
-    return torch.where(image[..., 3:] > 0, image, noise)[..., :3].contiguous()
-
-
-def write_dancer(folder: Path) -> None:
-    """A COLMAP model with masks and times."""
-    views = ball(16)
-    names = [f"frame_{number:04d}.jpg" for number in range(16)]
-    for index, name in enumerate(names):
-        save(folder / "images" / name, opaque(views.image(index)))
-        save(folder / "masks" / f"{name}.png", views.image(index)[..., 3].contiguous())
-    focal = float(views.intrinsics.focal[0, 0])
-    camera = {1: ("OPENCV", SIZE, SIZE, (focal, focal, SIZE / 2, SIZE / 2, -0.02, 0.0, 0.0, 0.0))}
-    poses = views.camera_to_world.double().numpy()
-    images = [(name, pose, 1, 2) for name, pose in zip(names, poses, strict=True)]
-    write_colmap(folder / "sparse" / "0", camera, images, [[0.1, 0.2, 0.3]])
-    rows = [f"{name},{index / 10}" for index, name in enumerate(names)]
-    (folder / "times.csv").write_text("\n".join(["file,time", *rows]) + "\n")
-
-
-def write_transforms(folder: Path, first: int = 0, ending: str = "png", **content: Any) -> None:
-    """nerfstudio's transforms.json, with images numbered from ``first``."""
-    views = ball(16)
-    frames = []
-    for index, pose in enumerate(views.camera_to_world.tolist()):
-        name = f"images/image{first + index:06d}.{ending}"
-        save(folder / name, opaque(views.image(index)))
-        frames.append({"file_path": name, "transform_matrix": pose, "time": index / 30})
-    content |= {"fl_x": float(views.intrinsics.focal[0, 0]), "w": SIZE, "h": SIZE}
-    (folder / "transforms.json").write_text(json.dumps({**content, "frames": frames}))
-
-
-def write_cameras(folder: Path, camera_name: str, ending: str) -> Views:
-    """A folder of images for each camera, whose first views are returned."""
-    firsts, times = ball(CAMERAS), torch.linspace(0, 1, FRAMES)
-    for camera, pose in enumerate(firsts.camera_to_world):
-        views = ball(FRAMES, poses=pose.repeat(FRAMES, 1, 1), times=times)
-        for index in range(FRAMES):
-            name = f"{camera_name.format(camera)}/{index:04d}.{ending}"
-            save(folder / name, opaque(views.image(index)))
-    return firsts
-
-
-def write_fly(folder: Path) -> None:
-    """Folders of images, and one frame of each camera in transforms.json."""
-    views = write_cameras(folder, "cam{}", "jpg")
-    known = {"fl_x": float(views.intrinsics.focal[0, 0]), "w": SIZE, "h": SIZE}
-    poses = enumerate(views.camera_to_world.tolist())
+def write_transforms(folder: Path, names: list[str], poses: np.ndarray) -> None:
+    """nerfstudio's transforms.json."""
     frames = [
-        {"file_path": f"cam{camera}/0000.jpg", "transform_matrix": pose, **known}
-        for camera, pose in poses
+        {"file_path": name, "transform_matrix": pose.tolist(), "time": index / 30}
+        for index, (name, pose) in enumerate(zip(names, poses, strict=True))
     ]
-    (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
-
-
-def write_kitchen(folder: Path) -> None:
-    """Neural 3D Video's calibration, with folders of images."""
-    write_poses_bounds(folder, write_cameras(folder, "cam{:02d}", "png"))
-
-
-def write_fern(folder: Path) -> None:
-    """LLFF's rows, and an image for each."""
-    views = ball(10)
-    for index in range(10):
-        save(folder / "images" / f"IMG_{index:04d}.png", opaque(views.image(index)))
-    write_poses_bounds(folder, views)
-
-
-def write_poses_bounds(folder: Path, views: Views) -> None:
-    """A row for each view's pose, size and focal length, near and far."""
-    rows = []
-    for index, pose in enumerate(views.camera_to_world):
-        right, up, back, place = pose[:3].double().numpy().T
-        size = np.array([SIZE, SIZE, float(views.intrinsics.focal[index, 0])])
-        matrix = np.stack([-up, right, back, place, size], axis=1)
-        rows.append([*matrix.ravel(), 1.0, 9.0])
-    np.save(folder / "poses_bounds.npy", np.array(rows))
+    content = {"fl_x": FOCAL, "w": SIZE, "h": SIZE, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the page's reader works."""
+    """Where the page's reader works: a small capture of four cameras in every format."""
     root = tmp_path_factory.mktemp("work")
     captures = root / "captures"
-    write_dancer(captures / "dancer")
-    write_transforms(captures / "statue", camera_model="OPENCV", k1=0.01)
-    write_transforms(captures / "hand", first=50, ending="jpg")
-    write_fly(captures / "fly")
-    write_kitchen(captures / "kitchen")
-    write_fern(captures / "fern")
+    for name in ("dancer", "statue", "hand", "excavator", "fly", "kitchen", "fern"):
+        (captures / name).mkdir(parents=True)
+    colmap(captures / "dancer", text=False)
+    rows = [f"{name}.png,{index / 10}" for index, name in enumerate(NAMES)]
+    (captures / "dancer/times.csv").write_text("\n".join(["file,time", *rows]) + "\n")
+    nerfstudio(captures / "statue")
+    blender(captures / "excavator")
     NerfiesFolder(captures / "broom", 10)
-    counts = {"train_views": 10, "val_views": 2, "test_views": 3}
-    demo = ensure_demo_scene(root / "demo", "balls", resolution=24, **counts)
-    demo.rename(captures / "excavator")
+    for index in range(len(NAMES)):
+        camera, frame = divmod(index, FRAMES)
+        for start in (f"fly/cam{camera}/", f"kitchen/cam{camera:02d}/", f"fern/images/{camera}_"):
+            save(captures / f"{start}{frame:04d}.png", before_noise(index))
+    firsts = POSES[::FRAMES]
+    for folder, poses in (("kitchen", firsts), ("fern", POSES)):
+        write_rows(captures / folder, poses, SIZE, SIZE, FOCAL)
+    names = [f"cam{camera}/0000.png" for camera in range(CAMERAS)]
+    write_transforms(captures / "fly", names, firsts)
+    names = [f"images/image{50 + index:06d}.jpg" for index in range(len(NAMES))]
+    write_transforms(captures / "hand", names, POSES)
+    for index, name in enumerate(names):
+        save(captures / "hand" / name, before_noise(index))
     return root
 
 
@@ -157,6 +94,11 @@ def each_capture(program: str) -> list[Any]:
     return found
 
 
+def composed(name: str | None, settings: list[str]) -> dict[str, Any]:
+    """What these settings compose to, of which options of groups are composed once."""
+    return changed((), *settings) if name else compose_plain(name, settings)
+
+
 def times_of(folder: Path) -> dict[Path, int]:
     """When each file was changed."""
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
@@ -165,6 +107,7 @@ def times_of(folder: Path) -> dict[Path, int]:
 @pytest.mark.parametrize("words", each_capture("xplanes inspect"))
 def test_inspect_as_the_page_says(words, place, monkeypatch, capsys):
     monkeypatch.chdir(place)
+    monkeypatch.setattr(inspect, "compose_plain", composed)
     before = times_of(place / "captures")
     smaller = [re.sub(r"^data.resolution=\d+$", "data.resolution=24", text) for text in words]
     assert main(["inspect", *smaller]) == 0, capsys.readouterr().err
@@ -190,7 +133,7 @@ def small(words: list[str]) -> list[str]:
 def test_training_reads_what_the_page_says(words, place, monkeypatch):
     monkeypatch.chdir(place)
     settings = [text for text in small(words) if not text.startswith("hydra.")]
-    scene = SceneDataModule(compose_plain("train", settings)["data"]).scene
+    scene = SceneDataModule(changed((), *settings)["data"]).scene
     assert {"train"} < set(scene.splits)
     assert len(scene.splits["train"]) > 4
 

@@ -121,11 +121,6 @@ def test_damaged_entries_are_reported_and_recomputed(folder, caplog, capsys, kin
     assert capsys.readouterr().out == ""
 
 
-def test_a_new_version_of_the_code_recomputes(folder, monkeypatch):
-    monkeypatch.setattr(cache_module, "VERSION", cache_module.VERSION + 1)
-    assert not StageCache(folder).stage("parts", INPUTS, Maker()).cached
-
-
 def test_a_disabled_cache_stores_nothing(tmp_path):
     make = Maker()
     for _ in range(2):

@@ -1,8 +1,8 @@
 """From a triplane sequence to planes, parts and reports."""
 
 import logging
+from dataclasses import replace
 from functools import partial
-from itertools import product
 from pathlib import Path
 
 import pytest
@@ -11,7 +11,7 @@ import torch
 from tests.balls import ball_scene
 from tests.preparation.sequences import OPTIONS, blob, moving_sequence, static_features
 from tests.refusals import assert_refused
-from tests.training.runs import same_state, small_config
+from tests.training.runs import UNSCORED, same_state, small_config
 from xplanes import run
 from xplanes.decomposition import unexplained_energy
 from xplanes.errors import ConfigError
@@ -74,24 +74,24 @@ def test_no_source_is_a_random_initialisation_that_touches_nothing(tmp_path):
     assert (module.model.product, module.site.initialised) == (None, False)
 
 
-def test_a_rank_one_initialisation_explains_what_moves(finished):
+@pytest.mark.parametrize(
+    ("model", "resolution", "rows"),
+    [("six_planes", 16, 8), ("nine_planes", 24, 8), ("six_planes", 9, 5), ("nine_planes", 9, 5)],
+)
+def test_a_rank_one_initialisation_explains_what_moves(finished, model, resolution, rows):
     folder, *_ = finished
-    for model, (resolution, rows) in product(
-        ("six_planes", "nine_planes"), ((16, 8), (24, 8), (9, 5))
-    ):
-        case = f"{model} of {resolution} texels, {rows} rows"
-        sizes = (f"model.resolution={resolution}", f"model.time_resolution={rows}")
-        found, module = initialised(folder, SEQUENCE, f"model={model}", *sizes)
-        field = module.field
-        count = len(PLANE_SETS[field.plane_set][-1]) * 3 if model == "nine_planes" else 3
-        assert field.space.shape == (3, resolution, resolution, 8), case
-        assert field.time.shape == (count, rows, resolution, 8), case
-        unexplained = found.report["unexplained"]
-        assert unexplained["before"] == pytest.approx(1, abs=0.05), case
-        # With fewer texels and rows than the blob needs, less of it can be held.
-        assert unexplained["after"] < (0.3 if resolution >= 16 else 0.8), case
-        again = unexplained_energy(field.time, module.model.sparse, rows=field.rows)
-        assert again == pytest.approx(unexplained["after"], rel=1e-5), case
+    sizes = (f"model.resolution={resolution}", f"model.time_resolution={rows}")
+    found, module = initialised(folder, SEQUENCE, f"model={model}", *sizes)
+    field = module.field
+    count = len(PLANE_SETS[field.plane_set][-1]) * 3 if model == "nine_planes" else 3
+    assert field.space.shape == (3, resolution, resolution, 8)
+    assert field.time.shape == (count, rows, resolution, 8)
+    unexplained = found.report["unexplained"]
+    assert unexplained["before"] == pytest.approx(1, abs=0.05)
+    # With fewer texels and rows than the blob needs, less of it can be held.
+    assert unexplained["after"] < (0.3 if resolution >= 16 else 0.8)
+    again = unexplained_energy(field.time, module.model.sparse, rows=field.rows)
+    assert again == pytest.approx(unexplained["after"], rel=1e-5)
 
 
 def test_the_initial_field_shows_the_static_part_where_nothing_moves(tmp_path):
@@ -108,7 +108,7 @@ def test_the_initial_field_shows_the_static_part_where_nothing_moves(tmp_path):
 
 
 def test_reports_and_seconds_are_whole(finished):
-    _, found, _ = finished
+    _, found, module = finished
     assert set(found.report) == {"xy", "xz", "yz", "unexplained"}
     for name in ("xy", "xz", "yz"):
         report = found.report[name]
@@ -123,6 +123,15 @@ def test_reports_and_seconds_are_whole(finished):
     picture = found.pictures["decomposition"]
     assert picture.shape == (3 * 132, 8 * 132, 3)
     assert 0 <= picture.min() < picture.max() <= 1
+    # Seeds change the noise only.
+    other, _ = initialised(finished[0], SEQUENCE, "seed=1")
+    assert torch.equal(found.values.planes["xy"], other.values.planes["xy"])
+    gap = (found.values.planes["xt"] - other.values.planes["xt"]).std()
+    assert float(gap) == pytest.approx(0.01 * 2**0.5, rel=0.1)
+    # No weight needs no sparse part.
+    _, module = initialised(finished[0], SEQUENCE, "model.loss.sparse_weight=0")
+    assert (module.model.sparse, module.model.product) == (None, None)
+    assert module.field.time is not None
 
 
 def test_a_second_initialisation_comes_from_the_cache(finished, monkeypatch):
@@ -164,9 +173,8 @@ def test_the_cache_can_be_switched_off(tmp_path, monkeypatch):
 def test_channels_decoder_and_frame_of_the_file_prevail(tmp_path):
     decoder = Decoder(4, **OPTIONS)
     frame = Frame(0.5, torch.eye(3), torch.tensor([0.1, 0.2, 0.3]))
-    sequence = TriplaneSequence(
-        moving_sequence(channels=4), decoder.state_dict(), dict(OPTIONS), frame
-    )
+    planes, state = moving_sequence(channels=4), decoder.state_dict()
+    sequence = TriplaneSequence(planes, state, dict(OPTIONS), frame)
     found, module = initialised(tmp_path, sequence, "model.precision=32")
     assert found.model.channels == 4
     assert "4 channels (not model.channels=8)" in found.description
@@ -175,13 +183,9 @@ def test_channels_decoder_and_frame_of_the_file_prevail(tmp_path):
     features = module.field.features(points, times)
     for ours, theirs in zip(module.field.decoder(features), decoder(features), strict=True):
         assert torch.equal(ours, theirs)
-
-
-def test_options_that_no_decoder_has_are_refused(tmp_path):
-    options = OPTIONS | {"activation": "sine"}
-    decoder = Decoder(8, **OPTIONS).state_dict()
+    sequence = replace(sequence, decoder_config=OPTIONS | {"activation": "sine"})
     with pytest.raises(ConfigError, match=r"triplanes\.pt: decoder_config\.activation=sine"):
-        initialised(tmp_path, TriplaneSequence(SEQUENCE.triplanes, decoder, options))
+        initialised(tmp_path, sequence)
 
 
 def test_a_scene_of_one_timestep_uses_the_low_rank_part_only(tmp_path):
@@ -213,21 +217,6 @@ def test_a_sequence_of_ones_own_source_is_checked(tmp_path):
         from_sequence(wrong, settings(tmp_path), place, StageCache(None), source="mine", seconds={})
 
 
-def test_seeds_change_the_noise_only(finished):
-    folder, first, _ = finished
-    other, _ = initialised(folder, SEQUENCE, "seed=1")
-    assert torch.equal(first.values.planes["xy"], other.values.planes["xy"])
-    gap = (first.values.planes["xt"] - other.values.planes["xt"]).std()
-    assert float(gap) == pytest.approx(0.01 * 2**0.5, rel=0.1)
-
-
-def test_no_weight_needs_no_sparse_part(finished):
-    folder, *_ = finished
-    _, module = initialised(folder, SEQUENCE, "model.loss.sparse_weight=0")
-    assert (module.model.sparse, module.model.product) == (None, None)
-    assert module.field.time is not None
-
-
 def test_a_source_that_is_not_there_is_refused_first(tmp_path):
     for overrides, words in (
         ((), "lrm=file needs lrm.triplanes=FILE"),
@@ -251,7 +240,7 @@ def test_processes_share_an_initialisation_through_a_folder_that_takes_files(tmp
 
 def test_the_video_of_a_run_shows_the_field_in_its_own_frame(scenes, tmp_path, monkeypatch):
     frame = Frame(0.4, torch.eye(3), torch.tensor([0.1, 0.2, 0.3]))
-    save_triplanes(tmp_path / "a.pt", TriplaneSequence(moving_sequence(), frame=frame))
+    save_triplanes(tmp_path / "a.pt", TriplaneSequence(moving_sequence(2), frame=frame))
     shown, original = [], render.render_path
 
     def note(field, renderer, frame, *others, **options):
@@ -260,7 +249,7 @@ def test_the_video_of_a_run_shows_the_field_in_its_own_frame(scenes, tmp_path, m
 
     monkeypatch.setattr(render, "render_path", note)
     monkeypatch.setattr(render, "FRAMES", 2)
-    source = ("lrm=file", f"lrm.triplanes={tmp_path}/a.pt", "preparation.cache=null")
+    source = ("lrm=file", f"lrm.triplanes={tmp_path}/a.pt", "preparation.cache=null", UNSCORED)
     plain = small_config(scenes, *source, "trainer.max_steps=1", "media=true", "logger=none")
     run.run(plain, tmp_path / "run", [], resume=False)
     (found,) = shown

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 
 import pytest
@@ -72,29 +71,25 @@ def video_scene(size=24, count=6):
     return replace(scene, video=video)
 
 
-def place_of(scene):
+def made_of(method, scene):
     frame = scene_frame(scene.splits["train"])
-    return Place(scene, frame, torch.device("cpu"), say=silent)
-
-
-def made_of(method, scene, cache=None):
-    place = place_of(scene)
+    place = Place(scene, frame, torch.device("cpu"), say=silent)
     lrm = method.lrm.load_model(silent)
-    made = reconstruct(method, method.lrm, place, lrm, StageCache(cache))
-    return made, lrm, place.frame
+    return reconstruct(method, method.lrm, place, lrm, StageCache(None)), lrm, frame
 
 
-def check_field_of_model(folder: Path, name: str, matching: str) -> None:
-    """The field has the colours and densities of the model, at their place in the world."""
-    method = settings(folder, name, f"lrm.matching={matching}", "lrm.crop=false")
+@pytest.mark.parametrize(
+    ("name", "matching"),
+    [("openlrm-1.0", "scale"), ("openlrm-1.1", "pad"), ("triposr", "scale"), ("triposr", "pad")],
+)
+def test_the_field_is_the_models_at_its_place_in_the_world(tmp_path, name, matching):
+    method = settings(tmp_path, name, f"lrm.matching={matching}", "lrm.crop=false")
     scene = video_scene()
     made, lrm, frame = made_of(method, scene)
     sequence, model = made.sequence, lrm.model
-    case = f"{name}, matching {matching}"
-    assert len(sequence.triplanes) == 3, case
+    assert len(sequence.triplanes) == 3
     alignment = align_to(FixedView(scene.video, frame.centre, 0.0, ""), model, method.lrm)
-    options = dict(sequence.decoder_config)
-    decoder = Decoder(sequence.triplanes.shape[2], **options)
+    decoder = Decoder(sequence.triplanes.shape[2], **dict(sequence.decoder_config))
     decoder.load_state_dict(dict(sequence.decoder))
     picture = straight_alpha(scene.video.images[:1])
     own = model.encode(model.prepare(alignment.crop.apply(picture)))[0]
@@ -105,7 +100,7 @@ def check_field_of_model(folder: Path, name: str, matching: str) -> None:
     kept = in_model.abs().amax(dim=-1) < model.half_side - texel
     in_field = sequence.frame.points(world)
     kept &= in_field.abs().amax(dim=-1) < 1 - 2 / sequence.triplanes.shape[-1]
-    assert kept.sum() > 100, case
+    assert kept.sum() > 100
     times = torch.zeros(len(world))
 
     def ask(triplane, decoder, points):
@@ -114,30 +109,20 @@ def check_field_of_model(folder: Path, name: str, matching: str) -> None:
 
     colour, density = ask(sequence.triplanes[0], decoder, in_field)
     expected_colour, expected = ask(own, model.decoder, in_model / model.half_side)
-    compare(colour[kept], expected_colour[kept], atol=2e-4, rtol=0, case=case)
+    compare(colour[kept], expected_colour[kept], atol=2e-4, rtol=0, case=name)
     # Both as density per unit of the world.
     density, expected = density * sequence.frame.scale, expected * alignment.frame.scale
-    compare(density[kept], expected[kept], rtol=2e-3, atol=1e-5, case=case)
-    assert density[kept].max() > 1e-4, case
+    compare(density[kept], expected[kept], rtol=2e-3, atol=1e-5, case=name)
+    assert density[kept].max() > 1e-4
     if name == "triposr":
         assert model.decoder.density_scale == pytest.approx(1 / CHORD)
 
 
-def test_the_field_is_the_models_at_its_place_in_the_world(tmp_path):
-    for name, matching in product(SIDES, ("scale", "pad")):
-        check_field_of_model(tmp_path / matching, name, matching)
-
-
-def test_the_cube_holds_all_that_the_views_show(tmp_path):
-    scene = video_scene()
-    for name in SIDES:
-        made, _, frame = made_of(settings(tmp_path, name), scene)
-        ball = inside_ball(3000, 1 / frame.scale) + frame.centre
-        assert made.sequence.frame.points(ball).abs().max() <= 1 + 1e-4, name
-
-
-def test_the_report_is_whole(tmp_path):
-    made, lrm, _ = made_of(settings(tmp_path, "openlrm-1.1"), video_scene())
+@pytest.mark.parametrize("name", SIDES)
+def test_the_cube_holds_all_that_the_views_show_and_the_report_is_whole(tmp_path, name):
+    made, lrm, frame = made_of(settings(tmp_path, name), video_scene())
+    ball = inside_ball(3000, 1 / frame.scale) + frame.centre
+    assert made.sequence.frame.points(ball).abs().max() <= 1 + 1e-4
     assert made.report["frames"] == made.report["distinct"] == 3
     assert made.report["cached"] == 0
     apart = made.report["mismatch_pixels"]
@@ -179,8 +164,5 @@ def test_missing_weights_name_the_way_out(tmp_path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     with pytest.raises(LRMError, match=r"446 MB.*CC-BY-NC-4\.0.*lrm\.weights=FILE"):
         Method.read(small_config(tmp_path, "lrm=small")).lrm.load(silent)
-
-
-def test_a_batch_without_images_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"lrm\.batch=0"):
         settings(tmp_path, "openlrm-1.1", "lrm.batch=0")

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from tests.balls import ball_views, surrounding, swinging
+from tests.training.runs import changed
 from xplanes.components import build
-from xplanes.config import compose_plain
 from xplanes.models.base import ModelSettings
 from xplanes.rendering.sampler import time_rows
 from xplanes.scenes.batches import STATIC_SHARE, RayBatches
@@ -58,7 +58,7 @@ def test_cameras_that_move_or_show_nothing_that_changes_are_left_alone():
 
 def test_rays_see_more_of_what_changes_and_all_of_the_rest():
     views, _ = rig()
-    settings = build(compose_plain("train", [])["model"], ModelSettings, "model").rays
+    settings = build(changed(())["model"], ModelSettings, "model").rays
     frame = scene_frame(views)
     drawn = RayBatches(views, frame, settings, seed=0)
     share = float(changing(views, [1] * len(views)).float().mean())

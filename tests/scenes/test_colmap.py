@@ -18,8 +18,8 @@ import torch
 
 from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings, write_colmap
 from tests.scenes.common import refused, told
+from tests.training.runs import changed
 from xplanes.components import build
-from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError
 from xplanes.scenes.cameras import cast_rays
 from xplanes.scenes.colmap import ColmapSettings
@@ -143,7 +143,7 @@ def test_lenses_shrink_with_images(capture):
         assert [named[name] for name in ("k1", "k2", "p1", "p2")] == list(OPENCV[4:])
 
 
-def test_points(capture):
+def test_points_tell_how_well_the_cameras_fit(capture):
     scene = capture.read("train")
     assert scene.points.tolist() == torch.tensor(POINTS).tolist()
     assert scene.notes["points"] == "2, 0.50 px from where images show them on average"
@@ -151,10 +151,7 @@ def test_points(capture):
     scene = capture.read("train")
     assert scene.points is None
     assert "points" not in scene.notes
-
-
-def test_cameras_that_fit_badly_are_worth_refining(capture):
-    """Two points with errors of 1 and 2 pixels, and one whose error COLMAP does not know."""
+    # Two points with errors of 1 and 2 pixels, and one whose error COLMAP does not know.
     capture.write(text=True)
     for path in (capture.path / "sparse/0").glob("*.bin"):
         path.unlink()
@@ -442,7 +439,7 @@ def test_one_camera_and_time_twice(capture):
 
 
 def test_folders_of_cameras_may_be_numbers():
-    plain = compose_plain("train", ["data=colmap", "data.test_cameras=[1,2]"])
+    plain = changed((), "data=colmap", "data.test_cameras=[1,2]")
     assert build(plain["data"], SceneSettings, "data").test_cameras == ["1", "2"]
 
 

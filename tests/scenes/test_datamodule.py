@@ -86,9 +86,7 @@ def test_held_out_views_are_of_many_cameras(cameras):
     counts = torch.tensor([place % cameras for place in places]).bincount(minlength=cameras)
     assert counts.min() >= 5, counts
     assert counts.max() <= 20, counts
-
-
-def test_held_out_views_of_one_camera_are_spread_evenly():
+    # Those of one camera are spread evenly.
     assert held_out_places([step / 30 for step in range(30)], 8) == [4, 12, 20, 28]
     assert held_out_places([0.0], 8) == []
 
@@ -119,12 +117,21 @@ def test_how_many_views_are_scored_does_not_change_what_is_trained_on():
     assert held_out[2] < held_out[None]
 
 
-def test_a_module_that_says_nothing_gets_rays_over_all_pixels_in_the_scenes_cube():
+def test_each_module_gets_batches_of_its_own_frame_and_settings():
     data = SceneDataModule.of(ball_scene(), seed=3)
     views = data.scene.splits["train"]
+    # A module that says nothing gets rays over all pixels in the scene's cube.
     expected = RayBatches(views, scene_frame(views), UNIFORM, seed=3).draw(0)
     assert same(take(data, 1)[0], expected)
     assert len(expected["times"]) == 1024
+    for frame, settings in (
+        (FRAME, RAYS),
+        (scene_frame(views), RAYS),
+        (FRAME, replace(RAYS, per_batch=16)),
+    ):
+        module = SimpleNamespace(ray_settings=settings, frame=frame)
+        expected = RayBatches(views, frame, settings, seed=3)
+        assert same(data.batches_for(module, 0).draw(0), expected.draw(0))
 
 
 def test_whole_views_are_cameras_and_what_they_saw():
@@ -174,16 +181,6 @@ def test_processes_share_the_views():
     # Lightning scores nothing in a process without a view, for which the others would wait.
     data.trainer = SimpleNamespace(global_rank=len(whole), world_size=len(whole) + 1)
     assert [batch["index"] for batch in data.val_dataloader()] == whole[:1]
-
-
-def test_each_module_gets_batches_of_its_own_frame_and_settings():
-    data = SceneDataModule.of(ball_scene(), seed=3)
-    for frame, settings in ((FRAME, RAYS), (scene_frame(data.scene.splits["train"]), RAYS)):
-        module = SimpleNamespace(ray_settings=settings, frame=frame)
-        expected = RayBatches(data.scene.splits["train"], frame, settings, seed=3)
-        assert same(data.batches_for(module, 0).draw(0), expected.draw(0))
-    other = replace(RAYS, per_batch=16)
-    assert data.batches_for(SimpleNamespace(ray_settings=other, frame=FRAME), 0).rays == 16
 
 
 def test_what_a_test_will_score_is_not_trained_on():

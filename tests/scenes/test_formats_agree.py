@@ -23,7 +23,7 @@ from xplanes.scenes.views import Scene, Views
 
 CAMERAS, FRAMES, SIZE, ANGLE = 4, 4, 24, 0.7
 FOCAL = 0.5 * SIZE / math.tan(0.5 * ANGLE)
-NAMES = [f"cam{camera:02d}/{frame:04d}" for camera in range(CAMERAS) for frame in range(FRAMES)]
+NAMES = [f"cam{k:02d}/frame_{frame:04d}" for k in range(CAMERAS) for frame in range(FRAMES)]
 TIMES = [frame / (FRAMES - 1) for _ in range(CAMERAS) for frame in range(FRAMES)]
 
 TRAIN, TEST = NAMES[FRAMES:], NAMES[:FRAMES]

@@ -3,14 +3,11 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 from tests.balls import inside_ball, surrounding
-from tests.lens_oracle import direction, pixel
-from xplanes.errors import SceneError
-from xplanes.preparation.fixed_view import check_camera
+from tests.lens_oracle import pixel
 from xplanes.scenes.batches import RayBatches
 from xplanes.scenes.cameras import ball_extent, cast_rays, look_at, project
 from xplanes.scenes.datamodule import UNIFORM
@@ -81,35 +78,24 @@ def cast(*names, rows, columns, pose=EYE, skew=0.0):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_rays_are_those_of_a_search(name):
-    model, k = LENSES[name]
-    generator = np.random.default_rng(0)
-    rows = torch.from_numpy(generator.uniform(-0.5, HEIGHT - 0.5, 12))
-    columns = torch.from_numpy(generator.uniform(-0.5, WIDTH - 0.5, 12))
-    for skew in (0.0, 1.5):
-        _, found = cast(name, rows=rows, columns=columns, skew=skew)
-        assert found.dtype == torch.float64
-        for ray, row, column in zip(found.tolist(), rows.tolist(), columns.tolist(), strict=True):
-            target = (column + 0.5, row + 0.5)
-            expected = direction(model, target, k, FOCAL, CENTRE, skew)
-            assert np.abs(np.subtract(ray, expected)).max() < 1e-9, (row, column)
-
-
-@pytest.mark.parametrize("name", LENSES)
 def test_points_on_rays_are_seen_at_their_pixels(name):
     model, k = LENSES[name]
     pose = look_at(torch.tensor([[1.0, -3.0, 2.0]], dtype=torch.float64))[0]
     rows, columns = grid()
-    origins, directions = cast(name, rows=rows, columns=columns, pose=pose, skew=0.7)
-    options = {"focal": torch.tensor(FOCAL), "centre": torch.tensor(CENTRE)}
-    points = origins + torch.linspace(0.5, 9, len(rows))[:, None] * directions
-    x, y, seen = project(pose, points, lenses=lenses_of(name, skew=0.7), **options)
-    assert seen.all()
-    torch.testing.assert_close(x, columns + 0.5, atol=1e-9, rtol=0)
-    torch.testing.assert_close(y, rows + 0.5, atol=1e-9, rtol=0)
-    local = (points[7] - pose[:3, 3]) @ pose[:3, :3]
-    expected = pixel(model, local.tolist(), k, FOCAL, CENTRE, 0.7)
-    assert expected == pytest.approx((float(x[7]), float(y[7])), abs=1e-9)
+    for skew in (0.0, 0.7):
+        origins, directions = cast(name, rows=rows, columns=columns, pose=pose, skew=skew)
+        assert directions.dtype == torch.float64
+        torch.testing.assert_close(directions.norm(dim=1), torch.ones_like(rows))
+        options = {"focal": torch.tensor(FOCAL), "centre": torch.tensor(CENTRE)}
+        points = origins + torch.linspace(0.5, 9, len(rows))[:, None] * directions
+        x, y, seen = project(pose, points, lenses=lenses_of(name, skew=skew), **options)
+        assert seen.all()
+        torch.testing.assert_close(x, columns + 0.5, atol=1e-9, rtol=0)
+        torch.testing.assert_close(y, rows + 0.5, atol=1e-9, rtol=0)
+        for point, *place in zip(points[::7], x[::7], y[::7], strict=True):
+            local = (point - pose[:3, 3]) @ pose[:3, :3]
+            expected = pixel(model, local.tolist(), k, FOCAL, CENTRE, skew)
+            assert expected == pytest.approx(tuple(map(float, place)), abs=1e-9)
 
 
 def test_lenses_of_one_batch_do_not_mix():
@@ -172,14 +158,11 @@ def test_fisheye_corners_have_no_rays_and_are_left_out():
     assert views.is_opaque
     assert torch.equal(views.valid()[0], intrinsics.has_ray(0))
     _, directions = views.image_rays(0)
-    assert directions.isfinite().all()
     assert directions.norm(dim=1).sub(1).abs().max() < 1e-5
     batches = RayBatches(views, cube_frame(1.0, torch.zeros(3)), UNIFORM, seed=0)
     assert batches.near_pixels + batches.far_pixels == int(views.valid().sum())
     assert (batches.draw(0)["alpha"] == 1).all()
-
-
-def test_whole_fisheye_images_have_all_their_rays():
+    # Whole images have all their rays.
     assert intrinsics_of("equidistant").has_ray(0) is None
     assert intrinsics_of("fisheye", focal=(20.0, 20.0)).has_ray(0) is None
 
@@ -221,7 +204,7 @@ def test_balls_reach_no_farther_than_said(name):
         seen = inside & extent.isfinite()
         assert seen.sum() > 20
         largest = torch.zeros(400, dtype=torch.float64)
-        for _ in range(60):
+        for _ in range(30):
             edge = torch.randn(400, 3, generator=generator, dtype=torch.float64)
             there_x, there_y, shown = seen_at(middle + radius * edge / edge.norm(dim=1)[:, None])
             moved = torch.maximum((there_x - x).abs(), (there_y - y).abs())
@@ -267,13 +250,3 @@ def test_pinholes_that_stand_for_lenses_see_as_wide():
         assert 2 * math.atan(22 / focal) == pytest.approx(angle, abs=1e-5)
     wide = intrinsics_of("equidistant", focal=(9.0, 9.0))
     assert wide.fov_y == pytest.approx(WIDEST)
-
-
-def test_a_distorted_video_is_refused_where_pinholes_are_needed():
-    poses = surrounding(1, 4.0).repeat(2, 1, 1)
-    centre = (WIDTH / 2, HEIGHT / 2)
-    views = seen_ball(["barrel"] * 2, poses, 0.5, centre=centre, focal=(35.0, 35.0))
-    with pytest.raises(SceneError, match=r"distorts.*preparation\.fixed_view=train"):
-        check_camera(views)
-    weak = replace(views.intrinsics.lenses, coefficients=views.intrinsics.lenses.coefficients / 50)
-    check_camera(replace(views, intrinsics=replace(views.intrinsics, lenses=weak)))

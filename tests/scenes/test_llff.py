@@ -1,10 +1,9 @@
 """Captures as LLFF's tools write them."""
 
-import numpy as np
 import pytest
 import torch
 
-from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings, write_colmap
+from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings, write_colmap, write_rows
 from tests.scenes.common import refused
 from xplanes.scenes.colmap import ColmapSettings
 from xplanes.scenes.llff import LlffSettings
@@ -16,14 +15,10 @@ COUNT = 10
 @pytest.fixture
 def folder(tmp_path):
     """Images in two sizes, of cameras whose axes are down, right and back in the file."""
-    rows = []
-    for index, pose in enumerate(poses(COUNT)):
+    for index in range(COUNT):
         save(tmp_path / "fern/images" / f"IMG_{index}.JPG", picture(index, 2 * HEIGHT, 2 * WIDTH))
         save(tmp_path / "fern/images_2" / f"IMG_{index}.png", picture(index))
-        right, up, back, centre = pose[:3].T
-        size = np.array([2 * HEIGHT, 2 * WIDTH, 70.0])
-        rows.append(np.r_[np.stack([-up, right, back, centre, size], axis=1).ravel(), 1.0, 9.0])
-    np.save(tmp_path / "fern/poses_bounds.npy", np.stack(rows))
+    write_rows(tmp_path / "fern", poses(COUNT), 2 * HEIGHT, 2 * WIDTH, 70.0)
     return tmp_path / "fern"
 
 
@@ -49,6 +44,9 @@ def test_cameras_and_images_of_the_width_asked_for(folder, resolution, width):
 
 def test_captures_of_dynamic_scenes_have_the_times_in_their_names(folder):
     assert read(folder, static=False).splits["train"].times[3] == pytest.approx(3 / 9)
+    (folder / "camera_paths").mkdir()
+    assert LlffSettings.recognises(folder)
+    assert not MultiCameraSettings.recognises(folder)
     for number in range(3):  # Nvidia's Dynamic Scenes have a folder for each timestep.
         save(folder / f"mv_images/{number:05d}/cam01.png", picture(number))
     assert LlffSettings.recognises(folder)
@@ -59,12 +57,6 @@ def test_captures_of_dynamic_scenes_have_the_times_in_their_names(folder):
     assert scene.splits["train"].times[3] == pytest.approx(3 / 9)
     assert "IMG_9.JPG -> 9" in scene.notes["times"]
     assert read(folder, static=True).splits["train"].times.tolist() != [0.0] * COUNT
-
-
-def test_folders_of_camera_paths_are_no_cameras(folder):
-    (folder / "camera_paths").mkdir()
-    assert LlffSettings.recognises(folder)
-    assert not MultiCameraSettings.recognises(folder)
 
 
 def test_models_of_colmap_beside_it_are_preferred(folder):

@@ -15,10 +15,10 @@ import pytest
 import torch
 
 from tests.balls import ball_views, surrounding, swinging
-from tests.captures import save, settings, write_colmap
+from tests.captures import save, settings, write_colmap, write_rows
 from tests.scenes.common import assert_same_rays, refused, told
+from tests.training.runs import changed
 from xplanes.components import build
-from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.optional import MissingExtraError
 from xplanes.scenes import store
@@ -76,22 +76,21 @@ def write_images(folder: Path, frames: np.ndarray) -> None:
 def neural_3d_video(folder: Path, write: Callable, suffix: str) -> Path:
     """The views in the layout of Neural 3D Video, with the calibration of twice their size."""
     folder.mkdir(parents=True)
-    rows = []
     for camera in range(CAMERAS):
         write(folder / f"cam{camera:02d}{suffix}", rgb(camera))
-        right, up, back, centre = POSES[camera][:3].T
-        hwf = np.array([2 * SIZE, 2 * SIZE, 2 * FOCAL])
-        matrix = np.stack([-up, right, back, centre, hwf], axis=1)
-        rows.append([*matrix.ravel(), 1.0, 9.0])
-    np.save(folder / "poses_bounds.npy", np.array(rows))
+    write_rows(folder, POSES, 2 * SIZE, 2 * SIZE, 2 * FOCAL)
     return folder
 
 
+def place(name: str | Callable[[int], str], camera: int) -> str:
+    """The name of a camera: of a format, or of a call."""
+    return name.format(camera) if isinstance(name, str) else name(camera)
+
+
 def with_transforms(folder: Path, name: str | Callable[[int], str]) -> None:
-    """A transforms.json in which the place of each camera is a format of its number, or a call."""
-    name = name.format if isinstance(name, str) else name
+    """A transforms.json with the place of each camera."""
     frames = [
-        {"file_path": name(camera), "transform_matrix": pose.tolist()}
+        {"file_path": place(name, camera), "transform_matrix": pose.tolist()}
         for camera, pose in enumerate(POSES)
     ]
     content = {"fl_x": FOCAL, "w": SIZE, "h": SIZE, "frames": frames}
@@ -100,9 +99,8 @@ def with_transforms(folder: Path, name: str | Callable[[int], str]) -> None:
 
 def with_colmap(folder: Path, name, *, height=2 * SIZE, cameras=CAMERAS, text=False) -> None:
     """A sparse model of one image of each camera, twice as large as the frames."""
-    name = name.format if isinstance(name, str) else name
     lens = {1: ("PINHOLE", 2 * SIZE, height, (2 * FOCAL, 2 * FOCAL, float(SIZE), float(SIZE)))}
-    images = [(name(camera), POSES[camera], 1, 3) for camera in range(cameras)]
+    images = [(place(name, camera), POSES[camera], 1, 3) for camera in range(cameras)]
     write_colmap(folder / "sparse" / "0", lens, images, text=text)
 
 
@@ -171,7 +169,13 @@ def test_videos_of_neural_3d_video(videos):
 
 
 def test_folders_of_images_keep_every_pixel(images):
+    for name in ("camera_paths", "mv_images/00000", "mv_images/00001"):  # Which are no cameras.
+        write_images(images / name, rgb(0)[:1])
+    (images / "camera_path.mp4").write_bytes(b"")
     require_all(read(images))
+    for name in ("camera_paths", "mv_images"):
+        shutil.rmtree(images / name)
+    (images / "camera_path.mp4").unlink()
     (images / "poses_bounds.npy").unlink()
     for name in ("cam{:02d}", "./cam{:02d}/5.png", "cam{:02d}\\5"):
         with_transforms(images, name)
@@ -180,10 +184,9 @@ def test_folders_of_images_keep_every_pixel(images):
 
 
 def test_cameras_in_map_coordinates_are_read_relative_to_a_point_near_them(images):
-    path = images / "poses_bounds.npy"
-    poses = np.load(path)
-    poses[:, [3, 8, 13]] += [500_000, 5_400_000, 300]
-    np.save(path, poses)
+    moved = POSES.copy()
+    moved[:, :3, 3] += [500_000, 5_400_000, 300]
+    write_rows(images, moved, 2 * SIZE, 2 * SIZE, 2 * FOCAL)
     with told(r"read relative to \(500001, 5399999, 302\)"):
         found = read(images, orient=False).splits["train"].camera_to_world[::FRAMES, :3, 3]
     away = (found - found[:1]) - torch.from_numpy(POSES[1:, :3, 3] - POSES[1:2, :3, 3])
@@ -194,7 +197,7 @@ def test_cameras_in_map_coordinates_are_read_relative_to_a_point_near_them(image
     ("outer", "inner", "name"),
     [
         *(("", "images", "{:04d}"), ("", "4x", "view_{}"), ("", "rgb/full", "cam{:02d}")),
-        ("frames", "", "CAM_{}"),
+        *(("frames", "", "CAM_{}"), ("", "", "Camera.{:03d}")),
     ],
 )
 def test_folders_of_cameras_may_have_other_names_and_levels(videos, tmp_path, outer, inner, name):
@@ -218,13 +221,6 @@ def test_some_cameras_have_no_number(tmp_path, names):
     assert sorted(path.stem for path in found) == sorted(names.split())
 
 
-def test_folders_may_have_names_with_dots(videos, tmp_path):
-    shutil.copy(videos / "poses_bounds.npy", tmp_path)
-    for camera in range(CAMERAS):
-        write_images(tmp_path / f"Camera.{camera:03d}", rgb(camera))
-    require_all(read(tmp_path, test_cameras=["Camera.000"]))
-
-
 def test_cameras_may_have_an_image_of_another_kind(images):
     for camera in range(CAMERAS):
         save(images / f"cam{camera:02d}" / "calibration.png", rgb(camera)[0])
@@ -239,13 +235,6 @@ def test_folders_of_single_views_are_no_cameras(tmp_path):
     for name in ("{:04d}/rgb.png", "{:04d}/depth_0"):
         with_transforms(tmp_path, name)
         assert NerfstudioSettings.recognises(tmp_path)
-
-
-def test_transforms_may_name_videos(videos, copied):
-    (copied / "poses_bounds.npy").unlink()
-    with_transforms(copied, "cam{:02d}.mp4")
-    one, other = read(copied), read(videos)
-    assert torch.equal(one.splits["train"].in_memory(), other.splits["train"].in_memory())
 
 
 @pytest.mark.parametrize(
@@ -353,22 +342,28 @@ def test_frames_by_range_and_stride(videos):
     assert len(few.splits["test"]) == 2
 
 
-def test_the_video_is_that_of_a_training_camera(videos):
+def test_the_video_is_that_of_a_training_camera(videos, caplog):
+    """By default the first camera is held out of training."""
     centres = VIEWS.camera_to_world[::FRAMES, :3, 3]
     away = (centres - centres.mean(dim=0)).norm(dim=1)
     central = 1 + int(away[1:].argmin())
-    video = read(videos).video
-    assert video.files == tuple(f"cam{central:02d}/{number:06d}" for number in range(FRAMES))
-    assert video.times.tolist() == pytest.approx(torch.linspace(0, 1, FRAMES).tolist())
+    with caplog.at_level("INFO"):
+        scene = read(videos, test_cameras=None)
+    assert {file.split("/")[0] for file in scene.splits["test"].files} == {"cam00"}
+    assert "held out cam00 of the cameras cam00, cam01" in caplog.text
+    assert scene.video.files == tuple(f"cam{central:02d}/{i:06d}" for i in range(FRAMES))
+    assert scene.video.times.tolist() == pytest.approx(torch.linspace(0, 1, FRAMES).tolist())
     assert read(videos, splits=("train",), video_camera="cam03").video.files[0][:5] == "cam03"
     for name in ("cam00", "cam9"):
         words = f"video_camera={name} is not a training camera.*must not see.*cam01, cam02"
         refuse(videos, words, video_camera=name)
 
 
-def test_large_captures_are_kept_on_disk(videos, tmp_path, monkeypatch, capsys):
-    expected = read(videos)
-    before = sorted(videos.iterdir())
+def test_large_captures_are_kept_on_disk(videos, copied, tmp_path, monkeypatch, capsys):
+    """And transforms.json may name videos."""
+    (copied / "poses_bounds.npy").unlink()
+    with_transforms(copied, "cam{:02d}.mp4")
+    expected, before = read(copied), sorted(videos.iterdir())
     monkeypatch.setattr(store, "IN_MEMORY", 0)
     scene = read(videos, cache=str(tmp_path / "cache"))
     assert f"{CAMERAS * FRAMES} images" in capsys.readouterr().out
@@ -385,26 +380,27 @@ def test_large_captures_are_kept_on_disk(videos, tmp_path, monkeypatch, capsys):
 
 def test_settings_of_the_command_line(videos):
     place = [f"data.root={videos.parent}", f"data.scene={videos.name}", "data.resolution=null"]
-    plain = compose_plain("train", ["data=multicamera", *place, "data.frames=[0,2,1]"])
+    plain = changed((), "data=multicamera", *place, "data.frames=[0,2,1]")
     settings = build(plain["data"], SceneSettings, "data")
     scene = settings.read()
     assert set(scene.splits) == {"train", "test"}
     assert len(scene.video) == 3
     assert not scene.static_reason
+    all_of_them = [f"cam0{camera}" for camera in range(CAMERAS)]
     for error, words, changes in (
         (SceneError, r"train_on_video=true.*already", {"train_on_video": True}),
         *((ConfigError, "frames=", {"frames": f}) for f in ([0, 1], [3, 2, 1], [-1, 2, 1])),
         (ConfigError, "frames=", {"frames": [0, 2, 0]}),
         (ConfigError, r"centre=\[1.0, 2.0\]: must be three", {"centre": [1, 2]}),
+        (SceneError, r"no camera cam7\. Its cameras are cam00, cam01", {"test_cameras": ["cam7"]}),
+        (SceneError, r"leaves no camera", {"test_cameras": all_of_them}),
     ):
         refused(lambda c=changes: replace(settings, **c).read(), words, case=changes, error=error)
-
-
-def test_a_camera_is_held_out_by_default(videos, caplog):
-    with caplog.at_level("INFO"):
-        scene = read(videos, test_cameras=None)
-    assert {file.split("/")[0] for file in scene.splits["test"].files} == {"cam00"}
-    assert "held out cam00 of the cameras cam00, cam01" in caplog.text
+    for words, options in (
+        (r"no split val: its splits are train, test", {"splits": ("val",)}),
+        (r"has no split test", {"test_cameras": []}),
+    ):
+        refuse(videos, words, error=MissingSplitError, **options)
 
 
 def test_cameras_of_different_lengths_and_rates(copied, caplog):
@@ -490,26 +486,6 @@ def test_images_that_are_missing_beside_videos(images):
     refuse(images, r"numbers of cam00/7\.png, cam01/7\.png\. Add what is")
 
 
-def test_folders_beside_cameras_are_none(images):
-    for name in ("camera_paths", "mv_images/00000", "mv_images/00001"):
-        write_images(images / name, rgb(0)[:1])
-    (images / "camera_path.mp4").write_bytes(b"")
-    require_all(read(images))
-
-
-@pytest.mark.parametrize(
-    ("words", "error", "options"),
-    [
-        (r"no split val: its splits are train, test", MissingSplitError, {"splits": ("val",)}),
-        (r"has no split test", MissingSplitError, {"test_cameras": []}),
-        (r"no camera cam7\. Its cameras are cam00, cam01", SceneError, {"test_cameras": ["cam7"]}),
-        (r"leaves no camera", SceneError, {"test_cameras": [f"cam0{i}" for i in range(4)]}),
-    ],
-)
-def test_splits_and_cameras_that_are_not_there(videos, words, error, options):
-    refuse(videos, words, error=error, **options)
-
-
 def test_damaged_and_missing_videos_are_named(copied):
     path = copied / "cam01.mp4"
     content = path.read_bytes()
@@ -593,34 +569,37 @@ def write_stamped(path: Path, frames: np.ndarray, stamps: list[int], **stream_op
         container.mux(stream.encode())
 
 
-def stamped(folder: Path, stamps: Callable[[int], list[int]]) -> Path:
-    """Videos of which each camera's frames have its own times."""
+@pytest.mark.parametrize(
+    ("stamps", "words", "first", "times"),
+    [
+        (lambda _: [0, 33, 67, 233, 267, 300], None, 0, [0, 0.11, 0.223, 0.777, 0.89, 1]),
+        (
+            lambda camera: [400 * (camera == 2) + 33 * n for n in range(6)],
+            r"cam02\.mkv begins 0\.4 s after .*trim the videos",
+            *(0, [0, 0.2, 0.4, 0.6, 0.8, 1]),
+        ),
+        (
+            lambda camera: [
+                400 * (camera == 2) + (40 if camera else 33) * n for n in range(FRAMES)
+            ],
+            r"cam02\.mkv begins 0\.4 s after .*these times are used.*trim the videos",
+            *(FRAMES, [2 / 3]),
+        ),
+    ],
+    ids=["variable", "one later", "different"],
+)
+def test_times_of_frames_are_those_of_the_files(tmp_path, stamps, words, first, times):
+    """A camera that begins later, and one of another rate, are told of."""
 
     def write(path: Path, frames: np.ndarray) -> None:
         write_stamped(path, frames, stamps(int(path.stem[-1])))
 
-    return neural_3d_video(folder / "scene", write, ".mkv")
-
-
-def test_times_of_variable_frame_rates_are_those_of_the_files(tmp_path):
-    stamps = [0, 33, 67, 233, 267, 300]
-    times = read(stamped(tmp_path, lambda camera: stamps)).splits["train"].times
-    assert times[:FRAMES].tolist() == pytest.approx([stamp / 300 for stamp in stamps], abs=0.01)
-
-
-def test_a_camera_that_begins_later_is_told_of(tmp_path):
-    late = (0, 0, 400, 0)
-    folder = stamped(tmp_path, lambda camera: [late[camera] + 33 * n for n in range(FRAMES)])
-    with told(r"cam02\.mkv begins 0\.4 s after .*trim the videos"):
-        times = read(folder).splits["train"].times
-    assert torch.allclose(times[:FRAMES], torch.linspace(0, 1, FRAMES))
-
-
-def test_times_of_different_rates_are_believed_aloud(tmp_path):
-    folder = stamped(tmp_path, lambda c: [400 * (c == 2) + (40 if c else 33) * n for n in range(6)])
-    with told(r"cam02\.mkv begins 0\.4 s after .*these times are used.*trim the videos"):
-        times = read(folder).splits["train"].times
-    assert times[FRAMES] == pytest.approx(2 / 3, abs=0.01)
+    folder = neural_3d_video(tmp_path / "scene", write, ".mkv")
+    with told(words):
+        found = read(folder).splits["train"].times[first:]
+    assert found[: len(times)].tolist() == pytest.approx(
+        times, abs=0.01 if first or not words else 1e-6
+    )
 
 
 @pytest.mark.parametrize("fast", range(2))

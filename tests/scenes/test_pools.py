@@ -57,18 +57,6 @@ def test_pixels_of_one_kind_take_no_list(near):
     assert torch.equal(pixels, (uniform * 70).long().clamp(max=69))
 
 
-def test_shares_of_kinds_are_those_asked_for():
-    near, plain, valid = masks((3, 40, 50))
-    found = PixelPools(near.clone(), plain, valid)
-    found.share(0.1, 0.5)
-    uniform = torch.rand(20000, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    far, pixels = found.pick(*uniform.T)
-    assert valid.flatten()[pixels].all()
-    assert torch.equal(far, ~near.flatten()[pixels])
-    assert far.float().mean() == pytest.approx(0.1, abs=0.01)
-    assert (near & plain).flatten()[pixels].float().mean() == pytest.approx(0.5, abs=0.01)
-
-
 GROWTH = """
 from pathlib import Path
 import torch

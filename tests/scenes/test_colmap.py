@@ -502,6 +502,7 @@ def test_truncated_binary_files(tmp_path):
         ("cameras", " -0.003", "", "has 7 parameters.*OPENCV.*has 8"),
         ("cameras", r"\Z", "1 PINHOLE 9 9 1 1 1 1", "camera 1.*is listed twice"),
         ("cameras", "OPENCV", "EUCM", "camera model EUCM.*undistorter"),
+        ("cameras", "OPENCV", "EQUIRECTANGULAR", "camera model EQUI.*cut perspective images"),
         ("cameras", "36.0", "-36.0", "fx=-36.0; it must be .*above 0"),
         ("cameras", "20.5", "nan", "cx=nan; it must be a finite"),
         ("cameras", " 40 ", " 0 ", "width=0; it must be .*above 0"),

@@ -87,10 +87,13 @@ def test_other_kinds_of_pixels_are_converted(tmp_path):
     assert (channels[3] == 255).all()
 
 
-def test_cmyk_is_refused_with_a_message(scene):
-    Image.new("CMYK", (12, 12)).save(scene.path / "train" / "r_1.jpg")
+def test_cmyk_is_read_and_lab_refused(scene):
+    Image.new("CMYK", (12, 12), (0, 255, 255, 0)).save(scene.path / "train" / "r_1.jpg")
     scene.change(1, file_path="train/r_1.jpg")
-    scene.refused("r_1.jpg", "CMYK", "RGBA")
+    assert scene.train().image(1)[0, 0].tolist() == pytest.approx([255, 0, 0, 255], abs=2)
+    Image.new("LAB", (12, 12)).save(scene.path / "train" / "r_1.tif")
+    scene.change(1, file_path="train/r_1.tif")
+    scene.refused("r_1.tif", "LAB", "RGBA")
 
 
 @pytest.mark.parametrize(("split", "splits"), [("test", ["train", "test"]), ("video", ["train"])])
@@ -473,6 +476,9 @@ def test_the_same_view_twice_or_a_mask_of_another_size(scene):
     ):
         scene.change(3, **(third | changes))
         scene.refused(f"frame 3.*{words}.*frame 1")
+    scene.change(3, **first)
+    with told(r"frame 3 \(.*r_1\) is listed before, as frame 1"):
+        assert len(scene.train()) == 4
     scene.change(3, **third)
     whole = json.dumps(scene.contents)
     scene.change(3, transform_matrix=first["transform_matrix"])

@@ -77,6 +77,8 @@ def numbers(views):
         ({"camera_model": "OPENCV", "k1": -0.05, "k3": 0.01, "k4": 0.004}, "POLYNOMIAL", {}),
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.03, "k4": 1e-4}, "FISHEYE", {}),
         ({"is_fisheye": True, "k1": 0.03}, "FISHEYE", {}),
+        ({"is_fisheye": "True", "k1": 0.03}, "FISHEYE", {}),
+        ({"is_fisheye": "false", "k1": 0.15}, "PERSPECTIVE", {}),
         (
             {"distortion_params": [0.1, 0.0, 0.01, 0.02, 0.001, -0.002]},
             "POLYNOMIAL",

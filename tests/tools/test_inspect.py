@@ -472,12 +472,13 @@ def test_errors_are_one_line_and_leave_1(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write_nerfstudio(tmp_path / "ball", ball().splits["train"])
     write_nerfstudio(tmp_path / "away", turned().splits["train"])
-    for name in ("packed/renders.zip", "trained/run.json"):
+    for name in ("packed/renders.zip", "rig/transforms_a.json", "trained/run.json"):
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).touch()
     cases = [
         (["missing"], "missing is not a folder"),
         (["."], r"not a scene of a known format. Scenes inside it: away, ball"),
+        (["rig"], r"Join the frames of transforms_a\.json in a transforms\.json\. What"),
         (["packed"], r"contains renders\.zip\. Unpack renders\.zip first.*ns-process-data"),
         (["trained"], "trained is a run, not a scene: xplanes render"),
         (["ball", "ball"], "give one folder"),

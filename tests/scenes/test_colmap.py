@@ -492,6 +492,12 @@ def test_truncated_binary_files(tmp_path):
         for count, words in ((1, "bytes follow the 1"), (2**62, f"of {2**62}")):
             (folder / name).write_bytes(struct.pack("<Q", count) + whole[8:])
             refused(read, words, str(folder / name), case=count)
+        (folder / name).write_bytes(whole)
+    whole = (PYCOLMAP / "cameras.bin").read_bytes()
+    (tmp_path / "cameras.bin" / "cameras.bin").write_bytes(
+        whole[:12] + struct.pack("<i", 17) + whole[16:]
+    )
+    refused(partial(read_model, tmp_path / "cameras.bin"), "camera model EQUIRECTANGULAR")
 
 
 @pytest.mark.parametrize(

@@ -4,11 +4,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from lightning import Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
 
 from tests.balls import RAYS, ball_scene, surrounding
-from tests.training.runs import checkpoint, metrics, same_state, small_config
+from tests.training.runs import checkpoint, gone_on, metrics, same_state, small_config
 from xplanes import RadianceModule
 from xplanes.errors import ConfigError
 from xplanes.rendering import refining
@@ -291,18 +289,11 @@ def test_a_run_refines_its_cameras(soon, scenes, tmp_path):
 def test_refinement_goes_on_exactly(soon, scenes, tmp_path):
     """From a checkpoint between two corrections, with sums that are half done."""
     scene = replace(ball_scene(), refine_cameras=True)
-    kept = ModelCheckpoint(tmp_path, "{step}", save_top_k=-1, every_n_train_steps=7)
-    found = []
-    for path in (None, tmp_path / "step=7.ckpt"):
-        module = RadianceModule(small_config(scenes))
-        trainer = Trainer(
-            accelerator="cpu", max_steps=12, max_epochs=-1, limit_val_batches=0, logger=False,
-            enable_progress_bar=False, enable_model_summary=False, callbacks=[kept],
-        )  # fmt: skip
-        trainer.fit(module, SceneDataModule.of(scene), ckpt_path=path)
-        found.append(module.state_dict())
-    assert found[0]["cameras.motion"].abs().max() > 0
-    same_state(*found)
+    whole, parts = (
+        end["state_dict"] for end in gone_on(scene, small_config(scenes), tmp_path, 12, 7)
+    )
+    assert whole["cameras.motion"].abs().max() > 0
+    same_state(whole, parts)
 
 
 def test_a_scene_in_python_says_whether_its_cameras_are_refined():

@@ -138,7 +138,7 @@ def test_planes_are_not_resumed_in_another_frame(train, tmp_path):
         frame = Frame(scale, torch.eye(3), torch.zeros(3))
         sequence = TriplaneSequence(moving_sequence(), frame=frame)
         save_triplanes(tmp_path / "triplanes.pt", sequence)
-        more = (UNSCORED, f"trainer.max_steps={steps}")
+        more = (*UNSCORED, f"trainer.max_steps={steps}")
         folder = train(*source(tmp_path), *more, resume=steps > 2)
         return (folder / "checkpoints" / "last.ckpt").read_bytes()
 
@@ -235,7 +235,7 @@ def test_l_r_moves_random_planes_towards_the_sparse_part(given, train):
     options = (
         *("model=nine_planes", "decomposition.dynamic=random", "decomposition.noise=0.1"),
         *("model.loss.every=1", "model.loss.initial_weight=0", "model.time_lr=0.1"),
-        *("trainer.max_steps=40", "model.warmup_steps=1", UNSCORED),
+        *("trainer.max_steps=40", "model.warmup_steps=1", *UNSCORED),
     )
     left = {}
     for weight in (0, 100):
@@ -255,7 +255,7 @@ def test_a_run_is_loaded_without_its_source(train, tmp_path):
     planes = moving_sequence(channels=4)
     sequence = TriplaneSequence(planes, decoder.state_dict(), dict(OPTIONS), frame)
     save_triplanes(tmp_path / "triplanes.pt", sequence)
-    overrides = (*source(tmp_path), "model=nine_planes", "trainer.max_steps=12", UNSCORED)
+    overrides = (*source(tmp_path), "model=nine_planes", "trainer.max_steps=12", *UNSCORED)
     folder = train(*overrides)
     (tmp_path / "triplanes.pt").unlink()
     shutil.rmtree(tmp_path / "cache")
@@ -273,14 +273,14 @@ def test_a_run_is_loaded_without_its_source(train, tmp_path):
 def test_a_run_from_one_triplane_is_loaded_too(train, tmp_path):
     sequence = TriplaneSequence(moving_sequence(frames=1))
     save_triplanes(tmp_path / "triplanes.pt", sequence)
-    folder = train(*source(tmp_path), "trainer.max_steps=2", UNSCORED)
+    folder = train(*source(tmp_path), "trainer.max_steps=2", *UNSCORED)
     assert metrics(folder)["decomposition"] == {}
     assert not (folder / "media" / "decomposition.png").exists()
     assert not load_run(folder).module.field.moves
 
 
 def test_an_unconverged_decomposition_warns_once(given, train, capfd):
-    few = ("decomposition.max_iterations=3", "trainer.max_steps=2", UNSCORED)
+    few = ("decomposition.max_iterations=3", "trainer.max_steps=2", *UNSCORED)
     folder = train(*given, *few)
     said = capfd.readouterr()
     assert said.err.count("did not converge") == 1
@@ -292,7 +292,7 @@ def test_an_unconverged_decomposition_warns_once(given, train, capfd):
 def test_triplanes_of_a_trained_field_initialise_a_field_with_equal_renders(train, tmp_path):
     """Checks end to end that orientation, time, decoder and frame of a file match the field's."""
     common = ("model=nine_planes", "model.precision=32")
-    trained = train(*common, "trainer.max_steps=30", UNSCORED, name="first")
+    trained = train(*common, "trainer.max_steps=30", *UNSCORED, name="first")
     first = load_run(trained)
     field, options = first.module.field, first.experiment.method.model.decoder
     with torch.no_grad():

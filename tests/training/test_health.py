@@ -42,7 +42,7 @@ from xplanes.training.diagnosis import (
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import claim, keeping_settings
 
-OFTEN = ("callbacks.checkpoints.every=5", "data.eval_views=1", UNSCORED)
+OFTEN = ("callbacks.checkpoints.every=5", "data.eval_views=1", *UNSCORED)
 LONG = ("trainer.max_steps=40", *OFTEN)
 """More steps than may be left out in a row."""
 

@@ -25,7 +25,7 @@ from xplanes.training.checkpoints import AtomicCheckpointIO, load_checkpoint
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import KEPT, RunRecord, require_same_run
 
-FEW = ("trainer.max_steps=6", UNSCORED)
+FEW = ("trainer.max_steps=6", *UNSCORED)
 PAGES = ("config.yaml", "overrides.txt", "metrics.json")
 
 

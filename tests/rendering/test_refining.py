@@ -62,33 +62,16 @@ def disturbed(poses, pixels, seed=3):
 
 
 def apart(poses, truth):
-    """Pixels by which points of the ball are displaced, without a common motion and scale. [V]"""
+    """Pixels by which points of the ball are displaced. [V]"""
     generator = torch.Generator().manual_seed(0)
     points = torch.randn(40, 3, generator=generator, dtype=torch.float64)
     points = FRAME.centre.double() + RADIUS / FRAME.scale * points / points.norm(dim=1)[:, None]
-
     lens = {"focal": torch.tensor([FOCAL, FOCAL]), "centre": torch.tensor([SIZE / 2, SIZE / 2])}
-
-    def seen(points, poses=poses):
-        images = [project(pose.double(), points, **lens)[:2] for pose in poses]
-        return torch.cat([torch.stack(image).flatten() for image in images])
-
-    wanted = seen(points, truth)
-    here, columns, step = seen(points), [], 1e-5
-    for k in range(7):  # Derivatives by a motion and a growth of all points.
-        moved = points.clone()
-        if k < 3:
-            moved[:, k] += step
-        elif k < 6:
-            axis = torch.eye(3, dtype=torch.float64)[k - 3].expand_as(points)
-            moved = moved + step * torch.linalg.cross(axis, points)
-        else:
-            moved = moved * (1 + step)
-        columns.append((seen(moved) - here) / step)
-    jacobian, difference = torch.stack(columns, dim=1), wanted - here
-    common = torch.linalg.lstsq(jacobian, difference[:, None]).solution
-    rest = (difference - (jacobian @ common)[:, 0]).view(len(poses), 2, -1)
-    return rest.square().sum(dim=1).mean(dim=1).sqrt()
+    here, there = (
+        torch.stack([torch.stack(project(pose.double(), points, **lens)[:2]) for pose in given])
+        for given in (poses, truth)
+    )
+    return (here - there).square().sum(dim=1).mean(dim=1).sqrt()
 
 
 def batches_of(views, rays=2048):

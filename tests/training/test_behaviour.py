@@ -51,7 +51,7 @@ def exact(folder: Path) -> dict:
 
 @pytest.fixture(scope="module")
 def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
-    """A run on images from disk whose pictures and checkpoints were noted; an epoch has 10 steps."""
+    """A run on images from disk whose pictures and checkpoints were noted; ten steps an epoch."""
     folder = tmp_path_factory.mktemp("runs") / "watched"
     cache = folder.with_name("cache")
     sizes = ("model.rays.per_batch=1024", "callbacks.checkpoints.every=6", "trainer.max_steps=20")
@@ -179,9 +179,10 @@ def test_interrupts_save_the_step_they_stop_at_and_evaluations_are_made_up_for(
 ):
     """One that is due at step 20, and the final one, though not a step is left to train then."""
     seldom, folder, before = "callbacks.checkpoints.every=1000", tmp_path / "run", handlers()
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         interrupt_where(lambda module: module.global_step == 20, patch)
-        train(seldom)
+        with pytest.raises(KeyboardInterrupt):
+            train(seldom)
     assert handlers() == before
     assert status(folder)["status"] == "interrupted"
     assert stopped_at(folder)[0] == 20
@@ -194,9 +195,10 @@ def test_interrupts_save_the_step_they_stop_at_and_evaluations_are_made_up_for(
             signal.raise_signal(signal.SIGINT)
         original(self, trainer, *rest)
 
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         patch.setattr(Evaluation, "on_validation_start", press)
-        train(seldom, resume=True)
+        with pytest.raises(KeyboardInterrupt):
+            train(seldom, resume=True)
     assert steps(folder) == ["0", "21"]
     train(seldom, resume=True)
     assert steps(folder) == ["0", "21", "40"]

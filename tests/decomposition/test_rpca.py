@@ -80,7 +80,7 @@ def test_recovers_low_rank_plus_sparse(rank, dtype):
 def test_every_scale_has_the_same_answer():
     matrix = mixture(dtype=torch.float32)
     unit = robust_pca(matrix, sparsity_weight=0.05)
-    for exponent in [-25, -6, -3, 0, 3, 6, 25]:
+    for exponent in [-25, -6, 6, 25]:
         scaled = robust_pca(matrix * 10.0**exponent, sparsity_weight=0.05)
         assert scaled.iterations == unit.iterations, exponent
         assert scaled.rank == unit.rank, exponent

@@ -43,21 +43,12 @@ def test_changed_weights_are_refused(tmp_path):
     content = bytearray(path.read_bytes())
     content[-5] ^= 1
     path.write_bytes(content)
-    with pytest.raises(LRMError, match=r"tiny\.safetensors is damaged.*SHA-256"):
+    words = r"tiny\.safetensors is damaged or belongs to another model: its SHA-256"
+    with pytest.raises(LRMError, match=words):
         load_bundled("tiny", tmp_path)
     path.write_bytes(content[:-100])
     with pytest.raises(LRMError, match=r"tiny\.safetensors is damaged"):
         load_bundled("tiny", tmp_path)
-
-
-def test_swapped_weights_are_refused(tmp_path):
-    tiny, mini = ship(tmp_path, "tiny"), ship(tmp_path, "mini", seed=1)
-    content = tiny.read_bytes()
-    tiny.write_bytes(mini.read_bytes())
-    mini.write_bytes(content)
-    for name in ("tiny", "mini"):
-        with pytest.raises(LRMError, match="belongs to another model"):
-            load_bundled(name, tmp_path)
 
 
 def test_a_model_that_is_not_there_is_named_with_those_that_are(tmp_path):

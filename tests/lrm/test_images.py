@@ -19,26 +19,6 @@ def test_composite():
     compare(composite_on(bytes_, 0.5).flatten(), torch.tensor([1.0, 0.0, 0.2]))
 
 
-def test_openlrm_keeps_the_corners():
-    rgba = picture()
-    prepared = prepare(rgba, "openlrm-1.1", 42)
-    assert prepared.shape == (1, 3, 42, 42)
-    assert prepared.min() >= 0
-    assert prepared.max() <= 1
-    white = composite_on(rgba, 1.0)
-    compare(prepared[0, :, 0, 0], white[0, :, 0, 0], atol=1e-5)
-    compare(prepared[0, :, -1, -1], white[0, :, -1, -1], atol=1e-5)
-
-
-def test_triposr_cuts_off_to_bytes():
-    rgba = torch.full((1, 4, 6, 6), 1.0)
-    rgba[:, :3] = 100.9 / 255
-    compare(prepare(rgba, "triposr", 6), torch.full((1, 3, 6, 6), 100 / 255), atol=1e-6)
-    nothing = torch.zeros(1, 4, 6, 6)
-    compare(prepare(nothing, "triposr", 3), torch.full((1, 3, 3, 3), 127 / 255), atol=1e-6)
-    compare(prepare(nothing, "openlrm-1.0", 3), torch.ones(1, 3, 3, 3))
-
-
 def test_windows_cut_and_pad():
     rgba = picture()
     assert torch.equal(Crop(2, 3, 10).apply(rgba), rgba[..., 2:12, 3:13])

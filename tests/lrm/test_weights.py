@@ -142,20 +142,16 @@ def test_silent_server_is_given_up_in_time(monkeypatch):
     assert time.monotonic() - start < 1
 
 
-def test_proxy_is_asked_instead(hub, monkeypatch):
-    address, _ = hub
-    monkeypatch.setenv("http_proxy", address)
-    monkeypatch.setenv("no_proxy", "")
-    assert answers("http://192.0.2.1")
-
-
-def test_one_proxy_for_all_schemes_is_asked(hub, monkeypatch):
+@pytest.mark.parametrize(
+    ("proxy", "target"), [("http_proxy", "http://192.0.2.1"), ("all_proxy", "https://192.0.2.1")]
+)
+def test_a_proxy_is_asked_instead(hub, monkeypatch, proxy, target):
     address, _ = hub
     for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("all_proxy", address)
+    monkeypatch.setenv(proxy, address)
     monkeypatch.setenv("no_proxy", "")
-    assert answers("https://192.0.2.1")
+    assert answers(target)
 
 
 def test_forbidden_download(monkeypatch, tmp_path):

@@ -41,7 +41,7 @@ def test_a_static_ball_is_kept_and_the_corners_are_not(size):
         assert not allowed_at(grid, corners, 0.0).any()
 
 
-@pytest.mark.parametrize("distance", [1.9, 2.2, 4.0])
+@pytest.mark.parametrize("distance", [1.9, 4.0])
 def test_content_close_to_wide_cameras_is_kept(distance):
     centre = torch.tensor([0.6, 0.6, 0.6])
     static = {"size": 160, "angle": 1.5, "centre": lambda _: centre, "times": torch.zeros(40)}
@@ -55,8 +55,8 @@ def test_content_close_to_wide_cameras_is_kept(distance):
 @pytest.mark.parametrize(
     ("count", "radius", "turns", "share"),
     [
-        *((count, 0.4, 0.25, 0.0) for count in (50, 200)),
-        *((count, 0.3, 1, 0.0005) for count in (50, 200)),
+        (50, 0.4, 0.25, 0.0),
+        (50, 0.3, 1, 0.0005),
         (200, 0.15, 2, 0.001),
     ],
 )

@@ -252,7 +252,7 @@ def same_places(found, expected):
 
 @needs_triton
 @pytest.mark.parametrize(
-    ("dtype", "share"), [(torch.float32, s) for s in (1.2, 1, 0.5, 0)] + [(torch.float64, 1)]
+    ("dtype", "share"), [(torch.float32, s) for s in (1.2, 0.5, 0)] + [(torch.float64, 1)]
 )
 def test_the_kernel_fills_a_fixed_number_of_places_as_the_twin_does(dtype, share):
     grid, rays = grid_of(7, 3), rays_of(12, dtype)
@@ -270,11 +270,10 @@ def same_cells(found, expected):
 
 
 @needs_triton
-@pytest.mark.parametrize("huge", [1e30, math.inf])
-def test_the_kernel_looks_as_far_as_a_ray_goes(huge):
+def test_the_kernel_looks_as_far_as_a_ray_goes():
     """Through several blocks of places, and with cells that are denser than float32 holds."""
     grid, rays = grid_of(8, 1, filled=1.1, dense=0.5), rays_of(6)
-    grid.least[::97] = huge
+    grid.least[::194], grid.least[97::194] = math.inf, 1e30
     found, expected = (take(rays, grid, step=0.011, occlusion=0.2) for take in (by_kernel, twin))
     same_cells(found, expected)
     assert found.occluded == expected.occluded > 0

@@ -6,7 +6,6 @@ import math
 import pytest
 import torch
 
-from xplanes.rendering.marching import Rays, march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.streams import counted_uniform
 
@@ -59,14 +58,6 @@ def presumed(*cells):
     likely[list(cells)] = True
     grid.presume(likely.view(2, 4, 4, 4))
     return grid
-
-
-def test_presumed_cells_are_empty_until_something_shows():
-    grid = presumed(5)
-    assert grid.occupied.nonzero().tolist() == [[5]]
-    assert grid.allowed.all()
-    grid.observe(torch.tensor([7]), torch.tensor([100.0]))
-    assert grid.occupied.nonzero()[:, 0].tolist() == [5, 7]
 
 
 def test_presumed_cells_fill_from_their_occupied_neighbours_on():
@@ -138,17 +129,6 @@ def test_a_cell_empties_when_its_initial_density_has_decayed():
         assert grid.occupied.sum() == len(grid.occupied) - 1, decay
 
 
-def test_a_cell_with_content_stays_and_an_empty_one_comes_back():
-    grid, cells = grid_of(), torch.tensor([3, 9])
-    for _ in range(50):
-        grid.observe(cells, torch.tensor([5.0, 0.0]))
-    assert grid.occupied[cells].tolist() == [True, False]
-    assert grid.density[3] == 5
-    grid.observe(torch.tensor([9]), torch.tensor([0.3]))
-    assert grid.occupied[9]
-    assert grid.density[9] == pytest.approx(0.3)
-
-
 def test_the_least_density_falls_at_once_and_rises_slowly():
     grid, cell = grid_of(), torch.tensor([4])
     assert grid.least[4] == 0
@@ -161,23 +141,6 @@ def test_the_least_density_falls_at_once_and_rises_slowly():
     grid.observe(torch.tensor([4, 4, 4]), torch.tensor([5.0, 0.2, 7.0]))
     assert grid.least[4] == pytest.approx(0.2)
     assert grid.density[4] == 7
-
-
-def test_what_is_there_only_at_times_hides_nothing():
-    passing, solid = grid_of(), grid_of()
-    cells = torch.arange(len(solid.density))
-    for look in range(100):
-        passing.observe(cells, torch.full((len(cells),), 50.0 * (look % 2)))
-        solid.observe(cells, torch.full((len(cells),), 50.0))
-    ray = [torch.tensor([v]) for v in ([-2.0, 0.1, 0.1], [1.0, 0.0, 0.0])]
-    rest = torch.zeros(1), torch.full((1,), 0.5)
-    whole, behind = (
-        march(Rays(*ray, *rest), grid, step=STEP, occlusion=1e-5) for grid in (passing, solid)
-    )
-    assert passing.occupied.all()
-    assert (passing.density > 20).all()
-    assert whole.occluded == 0
-    assert behind.occluded > 0
 
 
 def test_a_sweep_sees_that_a_cell_lets_light_through():
@@ -269,18 +232,6 @@ def test_cells_that_are_ruled_out_never_fill():
         assert not grid.occupied[out].any()
         assert (grid.density[out] == 0).all()
         assert grid.occupied[~out].all()
-
-
-def test_allow_takes_axes_in_the_order_z_y_x():
-    grid = grid_of(4, 2)
-    allowed = torch.zeros(2, 4, 4, 4, dtype=torch.bool)
-    allowed[1, 0, 1, 3] = True
-    grid.allow(allowed)
-    point = torch.tensor([[0.75, -0.25, -0.75]])  # x, y, z
-    assert (
-        grid.occupied.nonzero().flatten().tolist()
-        == cells_of(grid, point, torch.tensor([0.75])).tolist()
-    )
 
 
 def ball(points, times):

@@ -4,11 +4,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from lightning import Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
 
 from tests.balls import RAYS, ball_scene, surrounding
-from tests.training.runs import checkpoint, metrics, same_state, small_config
+from tests.training.runs import checkpoint, gone_on, metrics, same_state, small_config
 from xplanes import RadianceModule
 from xplanes.errors import ConfigError
 from xplanes.rendering import refining
@@ -64,33 +62,16 @@ def disturbed(poses, pixels, seed=3):
 
 
 def apart(poses, truth):
-    """Pixels by which points of the ball are displaced, without a common motion and scale. [V]"""
+    """Pixels by which points of the ball are displaced. [V]"""
     generator = torch.Generator().manual_seed(0)
     points = torch.randn(40, 3, generator=generator, dtype=torch.float64)
     points = FRAME.centre.double() + RADIUS / FRAME.scale * points / points.norm(dim=1)[:, None]
-
     lens = {"focal": torch.tensor([FOCAL, FOCAL]), "centre": torch.tensor([SIZE / 2, SIZE / 2])}
-
-    def seen(points, poses=poses):
-        images = [project(pose.double(), points, **lens)[:2] for pose in poses]
-        return torch.cat([torch.stack(image).flatten() for image in images])
-
-    wanted = seen(points, truth)
-    here, columns, step = seen(points), [], 1e-5
-    for k in range(7):  # Derivatives by a motion and a growth of all points.
-        moved = points.clone()
-        if k < 3:
-            moved[:, k] += step
-        elif k < 6:
-            axis = torch.eye(3, dtype=torch.float64)[k - 3].expand_as(points)
-            moved = moved + step * torch.linalg.cross(axis, points)
-        else:
-            moved = moved * (1 + step)
-        columns.append((seen(moved) - here) / step)
-    jacobian, difference = torch.stack(columns, dim=1), wanted - here
-    common = torch.linalg.lstsq(jacobian, difference[:, None]).solution
-    rest = (difference - (jacobian @ common)[:, 0]).view(len(poses), 2, -1)
-    return rest.square().sum(dim=1).mean(dim=1).sqrt()
+    here, there = (
+        torch.stack([torch.stack(project(pose.double(), points, **lens)[:2]) for pose in given])
+        for given in (poses, truth)
+    )
+    return (here - there).square().sum(dim=1).mean(dim=1).sqrt()
 
 
 def batches_of(views, rays=2048):
@@ -291,18 +272,11 @@ def test_a_run_refines_its_cameras(soon, scenes, tmp_path):
 def test_refinement_goes_on_exactly(soon, scenes, tmp_path):
     """From a checkpoint between two corrections, with sums that are half done."""
     scene = replace(ball_scene(), refine_cameras=True)
-    kept = ModelCheckpoint(tmp_path, "{step}", save_top_k=-1, every_n_train_steps=7)
-    found = []
-    for path in (None, tmp_path / "step=7.ckpt"):
-        module = RadianceModule(small_config(scenes))
-        trainer = Trainer(
-            accelerator="cpu", max_steps=12, max_epochs=-1, limit_val_batches=0, logger=False,
-            enable_progress_bar=False, enable_model_summary=False, callbacks=[kept],
-        )  # fmt: skip
-        trainer.fit(module, SceneDataModule.of(scene), ckpt_path=path)
-        found.append(module.state_dict())
-    assert found[0]["cameras.motion"].abs().max() > 0
-    same_state(*found)
+    whole, parts = (
+        end["state_dict"] for end in gone_on(scene, small_config(scenes), tmp_path, 12, 7)
+    )
+    assert whole["cameras.motion"].abs().max() > 0
+    same_state(whole, parts)
 
 
 def test_a_scene_in_python_says_whether_its_cameras_are_refined():

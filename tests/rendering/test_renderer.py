@@ -124,19 +124,6 @@ def test_each_ray_has_its_own_time_and_background():
     assert (clear.depth == 0).all()
 
 
-def test_a_nan_of_the_field_stays_on_its_ray(monkeypatch):
-    rays = rays_of(10)
-
-    def field(points, times):
-        colour, density = fog(1.0)(points, times)
-        return colour, torch.where(times == rays[2][4], math.nan, density)
-
-    for loops in ["1", "0"]:
-        monkeypatch.setenv("XPLANES_CPU_LOOPS", loops)
-        seen = renderer_of().render(field, *rays, WHITE)
-        assert seen.colour.isnan().any(dim=-1).nonzero().flatten().tolist() == [4], loops
-
-
 def clouds(points, times):
     """From air to what stops all light within a few samples."""
     return points.abs(), (40 * points.prod(dim=-1)).exp()

@@ -12,6 +12,8 @@ import pytest
 import torch
 from hydra import initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from lightning import Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
@@ -19,8 +21,8 @@ from xplanes.config import CONF, to_plain
 from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Scene
+from xplanes.training import fit
 from xplanes.training.clock import TrainingClock
-from xplanes.training.fit import Trainer
 from xplanes.training.module import RadianceModule
 
 SMALL = (
@@ -46,7 +48,7 @@ SMALL = (
     "media=false",
 )
 
-UNSCORED = "callbacks.evaluation.at=[]"
+UNSCORED = ("callbacks.evaluation.at=[]", "data.eval_views=1", "logger=none")
 """Training alone is looked at."""
 
 
@@ -85,23 +87,37 @@ def small_config(root: Path, *overrides: str) -> dict[str, Any]:
     return changed(SMALL, f"data.root={root}", *overrides)
 
 
+def quiet(folder: Path, steps: int) -> dict[str, Any]:
+    """Options of a trainer that logs and scores nothing."""
+    off = ("logger", "enable_progress_bar", "enable_model_summary")
+    options = {"accelerator": "cpu", "max_steps": steps, "default_root_dir": folder}
+    return options | dict.fromkeys(off, False) | {"limit_val_batches": 0}
+
+
 def train_quietly(
     module: RadianceModule, scene: Scene, folder: Path, steps: int, **more: Any
-) -> Trainer:
+) -> fit.Trainer:
     """A trainer that has trained a module and logged and written nothing."""
-    trainer = Trainer(
-        accelerator="cpu",
-        max_steps=steps,
-        default_root_dir=folder,
-        logger=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        enable_checkpointing=False,
-        limit_val_batches=0,
-        **more,
-    )
+    trainer = fit.Trainer(**quiet(folder, steps), enable_checkpointing=False, **more)
     trainer.train(module, SceneDataModule.of(scene))
     return trainer
+
+
+def gone_on(
+    scene: Scene, config: dict[str, Any], folder: Path, steps: int, *stops: int
+) -> list[dict[str, Any]]:
+    """Checkpoints after so many steps: of one run, and of runs that go on from steps of it."""
+    kept = ModelCheckpoint(folder, "{step}", save_top_k=-1, every_n_train_steps=1)
+    found = []
+    for stop in (None, *stops):
+        trainer = Trainer(
+            **quiet(folder, steps), max_epochs=-1, callbacks=[kept] if stop is None else []
+        )
+        start = None if stop is None else folder / f"step={stop}.ckpt"
+        trainer.fit(RadianceModule(config), SceneDataModule.of(scene), ckpt_path=start)
+        trainer.save_checkpoint(folder / "end.ckpt")
+        found.append(torch.load(folder / "end.ckpt", weights_only=True))
+    return found
 
 
 def metrics(folder: Path) -> dict[str, Any]:

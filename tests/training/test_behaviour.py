@@ -28,6 +28,7 @@ from xplanes.scenes import store
 from xplanes.scenes.batches import RayBatches
 from xplanes.training import evaluation, fit
 from xplanes.training.checkpoints import AtomicCheckpointIO
+from xplanes.training.diagnosis import not_finite
 from xplanes.training.evaluation import Evaluation
 from xplanes.training.module import RadianceModule
 
@@ -50,9 +51,12 @@ def exact(folder: Path) -> dict:
 
 @pytest.fixture(scope="module")
 def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
-    """A run whose pictures and checkpoints were noted."""
+    """A run on images from disk whose pictures and checkpoints were noted; ten steps an epoch."""
     folder = tmp_path_factory.mktemp("runs") / "watched"
-    notes = SimpleNamespace(folder=folder, pictures=[], saved=[])
+    cache = folder.with_name("cache")
+    sizes = ("model.rays.per_batch=1024", "callbacks.checkpoints.every=6", "trainer.max_steps=20")
+    config = small_config(scenes, f"data.cache={cache}", *sizes, "callbacks.evaluation.at=[0,0.6]")
+    notes = SimpleNamespace(folder=folder, cache=cache, config=config, pictures=[], saved=[])
     score = RadianceModule.validation_step
     save = AtomicCheckpointIO.save_checkpoint
 
@@ -66,10 +70,11 @@ def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNam
         save(self, checkpoint, path, **options)
 
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store, "IN_MEMORY", 0)
         patch.setattr(RadianceModule, "validation_step", note_picture)
         patch.setattr(evaluation, "SHOWN", 2)
         patch.setattr(AtomicCheckpointIO, "save_checkpoint", note_checkpoint)
-        run(small_config(scenes), folder, [], resume=False)
+        run(config, folder, [], resume=False)
     return notes
 
 
@@ -109,32 +114,20 @@ def same(folder: Path, whole: Path) -> None:
     assert ours == theirs
 
 
-def test_a_run_resumed_after_failures_equals_an_uninterrupted_one(
-    trained_run, watched, scenes, tmp_path
-):
-    """It fails between checkpoints, and at one with an evaluation."""
-    folder, config = tmp_path / "broken", small_config(scenes)
-    broken_off((13, 20), config, folder)
-    run(config, folder, [], resume=True)
-    same(folder, trained_run)
-    same(watched.folder, trained_run)
+def test_a_run_resumed_after_failures_equals_an_uninterrupted_one(watched, tmp_path, monkeypatch):
+    """It fails in a later epoch, at a checkpoint with an evaluation, and between checkpoints.
 
-
-def test_a_run_on_images_from_disk_resumes_in_a_later_epoch(scenes, tmp_path, monkeypatch):
-    """An epoch is ten batches; the decoded images are gone and are decoded again."""
+    The decoded images are gone and are decoded again.
+    """
     monkeypatch.setattr(store, "IN_MEMORY", 0)
-    cache, folder, whole = (tmp_path / name for name in ("cache", "broken", "whole"))
-    every = ("model.rays.per_batch=1024", "callbacks.checkpoints.every=6", "trainer.max_steps=20")
-    config = small_config(scenes, f"data.cache={cache}", *every)
-    run(config, whole, [], resume=False)
-    files = sorted(cache.glob("*.pixels"))
+    folder, files = tmp_path / "broken", sorted(watched.cache.glob("*.pixels"))
     assert [path.stat().st_size for path in files]
-    broken_off((14,), config, folder)
+    broken_off((12, 14), watched.config, folder)
     for path in files:
         path.unlink()
-    run(config, folder, [], resume=True)
-    assert sorted(cache.glob("*.pixels")) == files
-    same(folder, whole)
+    run(watched.config, folder, [], resume=True)
+    assert sorted(watched.cache.glob("*.pixels")) == files
+    same(folder, watched.folder)
 
 
 def interrupt_where(
@@ -160,20 +153,20 @@ def test_a_second_interrupt_saves_no_half_of_a_step(train, tmp_path, monkeypatch
 
     def press_twice(self) -> None:
         original(self)
-        if self.global_step == 17:
+        if self.global_step == 5:
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(RadianceModule, "on_after_backward", press_twice)
     with pytest.raises(KeyboardInterrupt):
-        train(UNSCORED)
-    assert stopped_at(tmp_path / "run") == (10, 10)
+        train(*UNSCORED, "callbacks.checkpoints.every=3")
+    assert stopped_at(tmp_path / "run") == (3, 3)
 
 
 def test_an_interrupt_waits_for_the_update_of_its_batches(train, tmp_path, monkeypatch):
     interrupt_where(lambda module: module.batches == 7, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
-        train(UNSCORED, "trainer.accumulate_grad_batches=3")
+        train(*UNSCORED, "trainer.accumulate_grad_batches=3")
     assert stopped_at(tmp_path / "run") == (3, 9)
 
 
@@ -181,29 +174,20 @@ def handlers() -> list:
     return [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
 
 
-def test_interrupt_saves_the_step_it_stopped_at_and_its_evaluation_is_done_again(
+def test_interrupts_save_the_step_they_stop_at_and_evaluations_are_made_up_for(
     trained_run, train, tmp_path, monkeypatch
 ):
-    # The evaluation at step 20 is due then.
-    interrupt_where(lambda module: module.global_step == 20, monkeypatch)
-    before, folder = handlers(), tmp_path / "run"
-    with pytest.raises(KeyboardInterrupt):
-        train("callbacks.checkpoints.every=1000")
+    """One that is due at step 20, and the final one, though not a step is left to train then."""
+    seldom, folder, before = "callbacks.checkpoints.every=1000", tmp_path / "run", handlers()
+    with monkeypatch.context() as patch:
+        interrupt_where(lambda module: module.global_step == 20, patch)
+        with pytest.raises(KeyboardInterrupt):
+            train(seldom)
     assert handlers() == before
     assert status(folder)["status"] == "interrupted"
     assert stopped_at(folder)[0] == 20
     assert steps(folder) == ["0"]
-    monkeypatch.undo()
-    train("callbacks.checkpoints.every=1000", resume=True)
-    assert steps(folder) == ["0", "21", "40"]
-    assert exact(folder) == exact(trained_run)
-    assert handlers() == before
 
-
-def test_a_final_evaluation_that_was_interrupted_is_made_up_for(
-    trained_run, train, tmp_path, monkeypatch
-):
-    """Though not a step is left to train."""
     original = Evaluation.on_validation_start
 
     def press(self, trainer, *rest) -> None:
@@ -211,13 +195,17 @@ def test_a_final_evaluation_that_was_interrupted_is_made_up_for(
             signal.raise_signal(signal.SIGINT)
         original(self, trainer, *rest)
 
-    monkeypatch.setattr(Evaluation, "on_validation_start", press)
-    with pytest.raises(KeyboardInterrupt):
-        train()
-    assert steps(tmp_path / "run") == ["0", "20"]
-    monkeypatch.undo()
-    folder = train(resume=True)
-    same(folder, trained_run)
+    with monkeypatch.context() as patch:
+        patch.setattr(Evaluation, "on_validation_start", press)
+        with pytest.raises(KeyboardInterrupt):
+            train(seldom, resume=True)
+    assert steps(folder) == ["0", "21"]
+    train(seldom, resume=True)
+    assert steps(folder) == ["0", "21", "40"]
+    assert status(folder)["status"] == "finished"
+    assert exact(folder) == exact(trained_run)
+    assert curve(folder)[-1]["psnr"] == curve(trained_run)[-1]["psnr"]
+    assert handlers() == before
     for name in ("last", "best"):
         ours, theirs = (checkpoint(place, name) for place in (folder, trained_run))
         assert ours["global_step"] == theirs["global_step"], name
@@ -257,14 +245,14 @@ def test_steps_after_the_budget_are_evaluated_at_their_end_alone(scenes, train, 
 def test_only_displayed_images_are_kept_in_memory(watched):
     assert len(watched.pictures) == 3 * 2
     assert not any(colour() is not None for colour in watched.pictures)
-    written = sorted((watched.folder / "media" / "step000040").glob("*.png"))
+    written = sorted((watched.folder / "media" / "step000020").glob("*.png"))
     # Named after the images, which lie in a folder of the split's name.
     assert [path.name for path in written] == ["val_r_000.png", "val_r_001.png"]
 
 
 def test_best_and_last_are_written_at_the_steps_that_say_so(watched):
-    assert [step for step, name in watched.saved if name == "best.ckpt"] == [20, 40]
-    assert [step for step, name in watched.saved if name == "last.ckpt"] == [10, 20, 30, 40, 40]
+    assert [step for step, name in watched.saved if name == "best.ckpt"] == [12, 20]
+    assert [step for step, name in watched.saved if name == "last.ckpt"] == [6, 12, 18, 20]
 
 
 @pytest.mark.parametrize(
@@ -288,27 +276,16 @@ def test_folder_with_a_run_is_refused_without_resume(trained_run, scenes):
     assert (trained_run / "metrics.json").read_bytes() == before
 
 
-def test_few_shot_run_names_its_views_and_accumulated_batches_make_one_step(train):
-    few = ("data.views=3", "trainer.max_steps=4")
-    folder = train(*few, "trainer.accumulate_grad_batches=2", UNSCORED)
-    files = status(folder)["files"]["train"]
-    assert len(files) == 3
-    assert files[0].endswith("r_000.png")
-    assert files[-1].endswith("r_009.png")
-    assert stopped_at(folder) == (4, 8)
-
-
 @pytest.mark.parametrize(
     ("overrides", "reason"),
     [
-        (["still_life"], "frames are equal"),
         (["still_life", "data.static=false"], None),
         (["excavator", "data.static=true"], "data.static=true"),
     ],
 )
 def test_a_scene_without_motion_has_no_time_planes(train, overrides, reason):
     scene, *rest = overrides
-    folder = train("trainer.max_steps=2", UNSCORED, f"data.scene={scene}", *rest)
+    folder = train("trainer.max_steps=2", *UNSCORED, f"data.scene={scene}", *rest)
     assert ("field.time" in checkpoint(folder)["state_dict"]) == (reason is None)
     assert metrics(folder)["skipped"]["static"] == (0.0 if reason is None else 1.0)
     text = (folder / "train.log").read_text()
@@ -316,7 +293,9 @@ def test_a_scene_without_motion_has_no_time_planes(train, overrides, reason):
     assert reason is None or reason in text
 
 
-def test_a_bad_batch_takes_those_of_its_update_along(train, monkeypatch):
+def test_accumulated_batches_of_few_views_make_one_step_and_a_bad_one_takes_all_along(
+    train, monkeypatch
+):
     original = RayBatches.draw
 
     def spoil(self, step: int, *rest):
@@ -326,8 +305,15 @@ def test_a_bad_batch_takes_those_of_its_update_along(train, monkeypatch):
         return batch
 
     monkeypatch.setattr(RayBatches, "draw", spoil)
-    folder = train("trainer.accumulate_grad_batches=2", "trainer.max_steps=3", UNSCORED)
+    few = ("data.views=3", "trainer.accumulate_grad_batches=2", "trainer.max_steps=3")
+    folder = train(*few, *UNSCORED)
+    files = status(folder)["files"]["train"]
+    assert len(files) == 3
+    assert files[0].endswith("r_000.png")
+    assert files[-1].endswith("r_009.png")
     content = metrics(folder)
     assert (content["steps_skipped"], content["step"]) == (1, 3)
+    assert stopped_at(folder) == (3, 6)
     (optimizer,) = checkpoint(folder)["optimizer_states"]
     assert {float(each["step"]) for each in optimizer["state"].values()} == {2}
+    assert not_finite(checkpoint(folder)["state_dict"].items()) == []

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from tests.balls import ball_scene, ball_views, swinging
-from tests.training.runs import UNSCORED, changed, checkpoint, same_state, small_config
+from tests.training.runs import UNSCORED, changed, gone_on, same_state, small_config
 from xplanes.models import x_planes
 from xplanes.models.initialisation import Method
 from xplanes.scenes.frame import cube_frame, pixels_across, pixels_of_detail
 from xplanes.training.module import RadianceModule
 
-FINE = ("model.fine.texels=40", "model.fine.start=8", "model.fine.channels=3", UNSCORED)
+FINE = ("model.fine.texels=40", "model.fine.start=2", "model.fine.channels=3")
 
 
 def settings(*overrides: str):
@@ -50,23 +50,21 @@ def test_they_may_be_given_or_left_out():
     assert module.field.fine.shape[-1] == 4 < module.parts.settings.fine.channels
 
 
-def test_they_are_zero_until_their_first_step_and_go_on_exactly(train):
-    for steps in (8, 9, 12):
-        # A limit in steps is no schedule: the rates depend on the share of it that is done.
-        options = (*FINE, "model.final_lr=1.0", f"trainer.max_steps={steps}")
-        parts = checkpoint(train(*options, name="parts", resume=steps > 8))
-        fine = parts["state_dict"]["field.fine"]
-        assert fine.shape == (3, 40, 40, 3)
-        assert bool(fine.any()) == (steps > 8)
-    whole = checkpoint(train(*options, name="whole"))
-    same_state(whole["state_dict"], parts["state_dict"])
+def test_they_are_zero_until_their_first_step_and_go_on_exactly(tmp_path):
+    whole, *parts = gone_on(ball_scene(), small_config(tmp_path, *FINE), tmp_path, 5, 2, 3)
+    for part in parts:
+        same_state(whole["state_dict"], part["state_dict"])
+    for step in (2, 3):
+        state = torch.load(tmp_path / f"step={step}.ckpt", weights_only=True)["state_dict"]
+        assert state["field.fine"].shape == (3, 40, 40, 3)
+        assert bool(state["field.fine"].any()) == (step > 2)
     groups = whole["optimizer_states"][0]["param_groups"]
     assert [group["name"] for group in groups] == ["space", "time", "fine", "decoder"]
 
 
 def test_a_checkpoint_knows_how_many_texels_the_images_asked_for(train, monkeypatch):
     monkeypatch.setattr(x_planes, "TEXEL_STEP", 4)
-    folder = train("model.resolution=8", "trainer.max_steps=2", UNSCORED)
+    folder = train("model.resolution=8", "trainer.max_steps=2", *UNSCORED)
     module = RadianceModule.load_from_checkpoint(folder / "checkpoints" / "last.ckpt")
     texels = module.method.model.fine_texels(module.site.pixels)
     assert texels == module.field.fine.shape[1] > 8

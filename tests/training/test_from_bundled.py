@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.balls import ball_scene
-from tests.training.runs import changed, composed, metrics
+from tests.training.runs import UNSCORED, changed, composed, metrics
 from xplanes.files import read_rows
 from xplanes.lrm.weights import bundled_models
 from xplanes.models.initialisation import Initialisation, Method, Place
@@ -21,7 +21,7 @@ SETTINGS = (
     "model.resolution=32",
     "preparation.cache=null",
     "preparation.frames=6",
-    "trainer.max_steps=30",
+    "trainer.max_steps=12",
     "callbacks.evaluation.at=[0]",
 )
 
@@ -76,10 +76,13 @@ def test_it_knows_the_scene_before_the_first_step(train, name):
 
 
 def test_a_scene_without_motion_trains_as_a_static_one(train):
-    folder = train(*SETTINGS, "lrm=tiny", "data.scene=still_life", "trainer.max_steps=1")
+    folder = train(*SETTINGS, "lrm=tiny", "data.scene=still_life", "trainer.max_steps=1", *UNSCORED)
     assert (metrics(folder)["lrm"]["frames"], metrics(folder)["lrm"]["distinct"]) == (1, 1)
     assert metrics(folder)["decomposition"] == {}
+    assert metrics(folder)["skipped"]["static"] == 1.0
     loaded = load_run(folder)
     assert not loaded.module.field.moves
     assert loaded.module.renderer.grid.time_bins == 1
-    assert "trains as a static one" in (folder / "train.log").read_text()
+    said = (folder / "train.log").read_text()
+    assert "trains as a static one" in said
+    assert "frames are equal" in said

@@ -1,18 +1,29 @@
 """Runs initialised from a Large Reconstruction Model: stages, files, resuming."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.preparation.test_reconstruct import CHOICES, publish
-from tests.training.runs import metrics, small_config, status
+from tests.training.runs import SMALL, changed, metrics, small_config, status
 from xplanes.models.initialisation import STAGES
+from xplanes.preparation import fixed_view
 from xplanes.preparation import reconstruct as reconstruct_module
 from xplanes.preparation import sources as sources_module
 from xplanes.run import run
 from xplanes.tools.evaluate import evaluate
 from xplanes.tools.runs import load_run
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_fields() -> Iterator[None]:
+    """The field that renders the fixed-view video is small too."""
+    sizes = [text for text in SMALL if text.startswith("model.")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fixed_view, "compose_plain", lambda _, lines: changed((*lines, *sizes)))
+        yield
 
 
 def source(place: Path, name: str) -> tuple[str, ...]:
@@ -21,7 +32,7 @@ def source(place: Path, name: str) -> tuple[str, ...]:
         *CHOICES[name],
         *(f"lrm.weights={publish(place / name, name)}", f"preparation.cache={place}/cache"),
         *("preparation.frames=3", "preparation.fixed_view_seconds=1000"),
-        *("preparation.fixed_view_steps=4", "trainer.max_steps=6", "callbacks.evaluation.at=[0]"),
+        *("preparation.fixed_view_steps=4", "trainer.max_steps=2", "callbacks.evaluation.at=[0]"),
     )
 
 

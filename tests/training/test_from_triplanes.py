@@ -132,20 +132,27 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
         assert metrics(folder)[key] == metrics(trained)[key]
 
 
-def test_planes_are_not_resumed_in_another_frame(train, tmp_path):
+def test_an_unconverged_decomposition_warns_once_and_goes_on_in_its_own_frame_alone(
+    train, tmp_path, capfd
+):
     def trained(scale: float, steps: int) -> bytes:
         """The last checkpoint of the run, which begins or goes on with a file of this scale."""
         frame = Frame(scale, torch.eye(3), torch.zeros(3))
         sequence = TriplaneSequence(moving_sequence(), frame=frame)
         save_triplanes(tmp_path / "triplanes.pt", sequence)
-        more = (UNSCORED, f"trainer.max_steps={steps}")
-        folder = train(*source(tmp_path), *more, resume=steps > 2)
+        few = ("decomposition.max_iterations=3", f"trainer.max_steps={steps}", *UNSCORED)
+        folder = train(*source(tmp_path), *few, resume=steps > 2)
         return (folder / "checkpoints" / "last.ckpt").read_bytes()
 
-    before = trained(0.5, 2)
+    before, folder = trained(0.5, 2), tmp_path / "run"
+    said = capfd.readouterr()
+    assert said.err.count("did not converge") == 1
+    assert f"from     8 triplanes of {tmp_path}/triplanes.pt" in said.out
+    assert "time planes rank1" in said.out
+    assert not metrics(folder)["decomposition"]["xy"]["converged"]
     with pytest.raises(ConfigError, match=r"frame is not the checkpoint's \(scale .*0\.5.*0\.6"):
         trained(0.6, 4)
-    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").read_bytes() == before
+    assert (folder / "checkpoints" / "last.ckpt").read_bytes() == before
 
 
 def state_at(step: int) -> TrainingState:
@@ -235,7 +242,7 @@ def test_l_r_moves_random_planes_towards_the_sparse_part(given, train):
     options = (
         *("model=nine_planes", "decomposition.dynamic=random", "decomposition.noise=0.1"),
         *("model.loss.every=1", "model.loss.initial_weight=0", "model.time_lr=0.1"),
-        *("trainer.max_steps=40", "model.warmup_steps=1", UNSCORED),
+        *("trainer.max_steps=40", "model.warmup_steps=1", *UNSCORED),
     )
     left = {}
     for weight in (0, 100):
@@ -255,7 +262,7 @@ def test_a_run_is_loaded_without_its_source(train, tmp_path):
     planes = moving_sequence(channels=4)
     sequence = TriplaneSequence(planes, decoder.state_dict(), dict(OPTIONS), frame)
     save_triplanes(tmp_path / "triplanes.pt", sequence)
-    overrides = (*source(tmp_path), "model=nine_planes", "trainer.max_steps=12", UNSCORED)
+    overrides = (*source(tmp_path), "model=nine_planes", "trainer.max_steps=2", *UNSCORED)
     folder = train(*overrides)
     (tmp_path / "triplanes.pt").unlink()
     shutil.rmtree(tmp_path / "cache")
@@ -273,31 +280,21 @@ def test_a_run_is_loaded_without_its_source(train, tmp_path):
 def test_a_run_from_one_triplane_is_loaded_too(train, tmp_path):
     sequence = TriplaneSequence(moving_sequence(frames=1))
     save_triplanes(tmp_path / "triplanes.pt", sequence)
-    folder = train(*source(tmp_path), "trainer.max_steps=2", UNSCORED)
+    folder = train(*source(tmp_path), "trainer.max_steps=2", *UNSCORED)
     assert metrics(folder)["decomposition"] == {}
     assert not (folder / "media" / "decomposition.png").exists()
     assert not load_run(folder).module.field.moves
 
 
-def test_an_unconverged_decomposition_warns_once(given, train, capfd):
-    few = ("decomposition.max_iterations=3", "trainer.max_steps=2", UNSCORED)
-    folder = train(*given, *few)
-    said = capfd.readouterr()
-    assert said.err.count("did not converge") == 1
-    assert f"from     8 triplanes of {given[1].partition('=')[2]}" in said.out
-    assert "time planes rank1" in said.out
-    assert not metrics(folder)["decomposition"]["xy"]["converged"]
-
-
 def test_triplanes_of_a_trained_field_initialise_a_field_with_equal_renders(train, tmp_path):
     """Checks end to end that orientation, time, decoder and frame of a file match the field's."""
     common = ("model=nine_planes", "model.precision=32")
-    trained = train(*common, "trainer.max_steps=30", UNSCORED, name="first")
+    trained = train(*common, "trainer.max_steps=30", UNSCORED[0], name="first")
     first = load_run(trained)
     field, options = first.module.field, first.experiment.method.model.decoder
     with torch.no_grad():
         sequence = TriplaneSequence(
-            triplanes_of(field, frames=20),
+            triplanes_of(field, frames=10),
             field.decoder.state_dict(),
             {name: getattr(options, name) for name in OPTIONS},
             first.frame,

@@ -18,7 +18,6 @@ from tests.training.runs import (
     UNSCORED,
     after_each_batch,
     checkpoint,
-    metrics,
     same_state,
     small_config,
     status,
@@ -42,7 +41,7 @@ from xplanes.training.diagnosis import (
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import claim, keeping_settings
 
-OFTEN = ("callbacks.checkpoints.every=5", "data.eval_views=1", UNSCORED)
+OFTEN = ("callbacks.checkpoints.every=5", "data.eval_views=1", *UNSCORED)
 LONG = ("trainer.max_steps=40", *OFTEN)
 """More steps than may be left out in a row."""
 
@@ -99,14 +98,6 @@ def refused(words: str, config: dict, folder: Path) -> str:
     return assert_refused(TrainingError, words, train, folder.name)
 
 
-def test_one_bad_gradient_costs_one_step(train, monkeypatch):
-    spoil_gradient(monkeypatch, 1e25, range(3, 4))
-    folder = train(*FEW, "trainer.max_steps=6")
-    content = metrics(folder)
-    assert (content["steps_skipped"], content["step"]) == (1, 6)
-    assert not_finite(checkpoint(folder)["state_dict"].items()) == []
-
-
 def test_gradients_that_stay_bad_end_training_with_a_message(scenes, tmp_path, monkeypatch):
     spoil_gradient(monkeypatch, math.nan, range(8, 1000))
     words = r"20 steps.*from step 7 on.*gradient of field\.space.*resume="
@@ -115,16 +106,6 @@ def test_gradients_that_stay_bad_end_training_with_a_message(scenes, tmp_path, m
     # Left out, a step counts, and changes nothing.
     assert kept["global_step"] == 25
     assert {float(each["step"]) for each in kept["optimizer_states"][0]["state"].values()} == {7}
-
-
-def test_gradients_that_are_bad_from_the_first_step_on(scenes, tmp_path, monkeypatch, impatient):
-    spoil_gradient(monkeypatch, 1e30, range(1000))
-    config = small_config(scenes, *LONG)
-    words = r"step 0 on.*gradient of field\.space.*check the values and gradients of XPlanes"
-    refused(words, config, tmp_path / "random")
-    refused(r"step 0 on.*of XPlanes and losses\.mine", with_loss(scenes, 99), tmp_path / "loss")
-    initialised_as(True, monkeypatch)
-    refused(r"step 0 on.*initialisation is to blame.*lrm=none", config, tmp_path / "start")
 
 
 def initialised_as(known: bool, monkeypatch: pytest.MonkeyPatch, spoil: bool = False) -> None:
@@ -172,15 +153,6 @@ def with_loss(scenes: Path, first: int) -> dict:
     return small_config(scenes, *LONG) | {"losses": {"mine": term}, "plugins": [__name__]}
 
 
-@pytest.mark.parametrize(("first", "more"), [(0, r"omit it$"), (7, r"omit it; resume=")])
-def test_an_added_loss_that_is_not_finite_is_named(scenes, tmp_path, impatient, first, more):
-    words = (
-        rf"the loss was nan.*from step {first} on; not finite: losses\.mine; largest"
-        rf".*The rendering is finite: correct losses\.mine or {more}"
-    )
-    assert "initialisation" not in refused(words, with_loss(scenes, first), tmp_path)
-
-
 def terms_with(name: str, form: str, own: Any = 0.0) -> dict[str, torch.Tensor]:
     """The terms of a loss: one of a model's own, and another of this name."""
     model = Mock(losses=lambda *_: {"own": own})
@@ -206,19 +178,38 @@ def test_a_term_of_the_loss_is_one_number_and_takes_no_other_ones_place():
         terms_with("own", "one")
 
 
+NOT_FINITE = (
+    r"the loss was nan.*from step {} on; not finite: losses\.mine; largest.*The rendering is "
+)
+NOT_FINITE += r"finite: correct losses\.mine or omit it{}"
+
+
 @pytest.mark.parametrize(
-    ("initialised", "words"),
+    ("spoiled", "initialised", "first", "words"),
     [
-        (True, r"initialisation is to blame.*set lrm=none"),
-        (False, r"No step was done yet: check the values and gradients of XPlanes"),
+        (
+            "gradient",
+            False,
+            None,
+            r"step 0 on.*gradient of field\.space.*check the val.*of XPlanes",
+        ),
+        ("gradient", False, 99, r"step 0 on.*of XPlanes and losses\.mine"),
+        ("gradient", True, None, r"step 0 on.*initialisation is to blame.*lrm=none"),
+        ("bias", True, None, r"initialisation is to blame.*set lrm=none"),
+        ("bias", False, None, r"No step was done yet: check the values and gradients of XPlanes"),
+        ("nothing", False, 0, NOT_FINITE.format(0, "$")),
+        ("nothing", False, 7, NOT_FINITE.format(7, "; resume=")),
     ],
 )
-def test_the_initialisation_is_blamed_if_there_was_one_and_it_renders_nothing_finite(
-    scenes, tmp_path, monkeypatch, impatient, initialised, words
+def test_what_is_to_blame_is_named(
+    scenes, tmp_path, monkeypatch, impatient, spoiled, initialised, first, words
 ):
-    initialised_as(initialised, monkeypatch, spoil=True)
-    said = refused(words, small_config(scenes, *LONG), tmp_path)
-    assert ("initialisation" in said) == initialised
+    """An initialisation, where there was one, a field, or a loss that was added from some step."""
+    if spoiled == "gradient":
+        spoil_gradient(monkeypatch, 1e30, range(1000))
+    initialised_as(initialised, monkeypatch, spoil=spoiled == "bias")
+    config = small_config(scenes, *LONG) if first is None else with_loss(scenes, first)
+    assert ("initialisation" in refused(words, config, tmp_path)) == initialised
 
 
 def test_a_checkpoint_never_holds_what_is_not_finite(train, tmp_path, monkeypatch):

@@ -25,7 +25,7 @@ from xplanes.training.checkpoints import AtomicCheckpointIO, load_checkpoint
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import KEPT, RunRecord, require_same_run
 
-FEW = ("trainer.max_steps=6", UNSCORED)
+FEW = ("trainer.max_steps=6", *UNSCORED)
 PAGES = ("config.yaml", "overrides.txt", "metrics.json")
 
 
@@ -96,9 +96,9 @@ def test_the_best_is_chosen_by_the_same_views_throughout(train, monkeypatch, sav
         return replace(found, psnr=found.psnr - 10 * (item["index"] != 0))
 
     monkeypatch.setattr(module, "score_image", score)
-    few = ("trainer.limit_val_batches=1", "callbacks.evaluation.at=[0,0.5]")
+    few = ("trainer.limit_val_batches=1", "callbacks.evaluation.at=[0,0.5]", "trainer.max_steps=4")
     folder = train(*few, "callbacks.checkpoints.every=99")
-    assert [state["global_step"] for name, state in saved if name == "best.ckpt"] == [20, 40]
+    assert [state["global_step"] for name, state in saved if name == "best.ckpt"] == [2, 4]
     assert len(metrics(folder)["views"]) == 3  # In the end all are looked at.
 
 
@@ -208,7 +208,7 @@ def test_a_missing_split_is_held_out_of_training_or_nothing_is_the_best(
     data = {name: value for name, value in usual.items() if name in known}
     data |= {"_target_": "xplanes.scenes.dnerf.BlenderSettings", "mask_use": "auto"}
     data |= {"root": str(tmp_path / "scenes"), "scene": "few"}
-    done = train(*FEW, "callbacks.evaluation.at=[0]", data=data)
+    done = train(*FEW, "trainer.max_steps=1", "callbacks.evaluation.at=[0]", data=data)
     split = "val" if "test" in missing else "test"
     assert (metrics(done)["split"], len(metrics(done)["views"])) == (split, scored)
     assert {row["split"] for row in read_rows(done / "curve.csv")} == {split}

@@ -18,7 +18,6 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from hydra_plugins.xplanes import ALIASES
-from tests import warm
 from tests.balls import ball_scene
 from tests.inside import train
 from tests.test_contracts import built, small
@@ -331,7 +330,8 @@ def test_a_job_of_a_cluster_that_was_killed_goes_on(tmp_path):
     words = ["-m", *launcher, f"hydra.sweep.dir={folder}", "resume=auto", root]
     words += [*SMALL_RUN, "seed=0,1,2,3", "callbacks.checkpoints.every=5", "trainer.max_steps=150"]
     command = [sys.executable, str(CONF.parent / "train.py"), *words]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    silent: dict = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
+    process = subprocess.Popen(command, **silent)
     try:
         killed = "2_*_s2/checkpoints/last.ckpt"
         while not (found := list(folder.glob(killed))) and process.poll() is None:
@@ -345,7 +345,7 @@ def test_a_job_of_a_cluster_that_was_killed_goes_on(tmp_path):
     assert not (run / "metrics.json").exists()
     assert all((other / "metrics.json").is_file() for other in others)
     kept = [read_json(other / "metrics.json")["test"] for other in others]
-    warm.train(*words)
+    subprocess.run(command, check=True, timeout=240, **silent)
     assert read_json(run / "run.json")["resumed"] == 1
     assert read_json(run / "metrics.json")["step"] == 150
     assert [read_json(other / "metrics.json")["test"] for other in others] == kept

@@ -221,9 +221,17 @@ def test_a_sweep_is_run_with_the_flag(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_sweep_is_run_alone():
-    with pytest.raises(ConfigError, match=r"one sweep at a time.* -m sweep=table1; .*sweep=fair"):
-        looked_ahead("sweep=table1,fair")
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("sweep=table1,fair", r"one sweep at a time.* -m sweep=table1; .*sweep=fair"),
+        ("sweep=table1 model=tineuvox_s", r"no row .* model=nine_planes recipe=paper"),
+        (f"sweep=suite {SMALL}", "sweep=suite has no small version"),
+    ],
+)
+def test_a_sweep_that_cannot_be_is_refused(given, words):
+    with pytest.raises(ConfigError, match=words):
+        looked_ahead(*given.split())
 
 
 def test_a_sweep_looks_for_its_data_and_weights_first(tmp_path):
@@ -238,13 +246,6 @@ def test_a_sweep_looks_for_its_data_and_weights_first(tmp_path):
     given = ("data.scene=lego", f"data.root={tmp_path}", "lrm=small")
     with pytest.raises(LRMError, match=r"none\.safetensors is not a file"):
         looked_ahead("sweep=rank", *given, f"lrm.weights={tmp_path / 'none.safetensors'}")
-
-
-def test_rows_and_sizes_that_a_sweep_does_not_have_are_named():
-    with pytest.raises(ConfigError, match=r"no row .* model=nine_planes recipe=paper"):
-        looked_ahead("sweep=table1", "model=tineuvox_s")
-    with pytest.raises(ConfigError, match="sweep=suite has no small version"):
-        looked_ahead("sweep=suite", SMALL)
 
 
 def test_how_long_a_sweep_takes_is_said():

@@ -82,13 +82,6 @@ def test_settings_are_checked_before_the_run_directory_is_made(tmp_path, monkeyp
     assert not list(tmp_path.iterdir())
 
 
-def test_missing_scene_says_where_to_get_one(tmp_path):
-    given = (f"data.root={tmp_path}", "data.scene=nothing", f"hydra.run.dir={tmp_path / 'run'}")
-    result = inside.train("data=dnerf", *given, code=1)
-    assert str(tmp_path / "nothing") in result.stderr
-    assert "data=demo" in result.stderr
-
-
 def test_devices_in_a_sweep_are_refused(tmp_path):
     result = inside.train("-m", "trainer=ddp", "seed=0,1", f"hydra.sweep.dir={tmp_path}", code=1)
     assert "one device per job" in (result.stdout + result.stderr)

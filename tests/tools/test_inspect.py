@@ -268,14 +268,8 @@ WRONG = {
     ),
     "white on white": (lambda: painted(white), "white: .*100% of the silhouettes"),
     "opaque white": (lambda: painted(on_white), "white: .*the images are opaque"),
-    "empty images": (
-        lambda: painted(emptied),
-        "empty: .*8 of 20 images show",
-    ),
-    "a mask is missing": (
-        lambda: painted(some_full),
-        "opaque: .*2 of 20 images",
-    ),
+    "empty images": (lambda: painted(emptied), "empty: .*8 of 20 images show"),
+    "a mask is missing": (lambda: painted(some_full), "opaque: .*2 of 20 images"),
     "useless masks": (lambda: painted(hardly_masked), "opaque: .*20 of 20 .* less tha"),
     "inverted masks": (lambda: painted(inverted), "inverted: .*of 20 images are opaqu"),
     "stray pixels": (

@@ -97,6 +97,26 @@ def yaml_read_once() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def composed_once() -> Iterator[None]:
+    """Many tests compose the same: only groups of a test's own are composed again."""
+    import hydra
+
+    compose, made = hydra.compose, {}
+
+    def once(name: str | None, overrides: list[str], return_hydra_config: bool = False) -> Any:
+        if any("searchpath" in text for text in overrides):
+            return compose(name, overrides, return_hydra_config)
+        key = (name, *overrides, return_hydra_config and Path.cwd())
+        if key not in made:
+            made[key] = compose(name, overrides, return_hydra_config)
+        return copy.deepcopy(made[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hydra, "compose", once)
+        yield
+
+
 @pytest.fixture(scope="session")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where demo scenes are rendered once for all processes. Copy one before changing it."""

@@ -212,32 +212,12 @@ def _selects(func: Any, args: Any) -> bool:
     return masked and not (func.overloadpacket is not aten.index and args[2].numel() == 1)
 
 
-class _Module:
-    """What ``torch.fake`` answers."""
-
-    @staticmethod
-    def is_initialized() -> bool:
-        return True
+class _Module(getattr(backend_registration, "_DummyBackendModule", object)):
+    """What ``torch.fake`` answers, and torch's stand-in does not."""
 
     @staticmethod
     def is_available() -> bool:
         return False  # Nobody else is to choose it.
-
-    @staticmethod
-    def _is_in_bad_fork() -> bool:
-        return False
-
-    @staticmethod
-    def manual_seed_all(seed: int) -> None:
-        return
-
-    @staticmethod
-    def device_count() -> int:
-        return 1
-
-    @staticmethod
-    def current_device() -> int:
-        return 0
 
     @staticmethod
     def synchronize(device: object = None) -> None:

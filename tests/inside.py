@@ -1,4 +1,4 @@
-"""Commands in this process, which `tests.warm` gives processes of their own."""
+"""Commands in this process, as if it were one of their own."""
 
 import atexit
 import contextlib

@@ -4,7 +4,7 @@ from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.accelerators import Accelerator
+from lightning.pytorch.accelerators import CPUAccelerator
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.strategies import SingleDeviceStrategy
 
@@ -12,37 +12,11 @@ from tests.fake_device import NAME, Counts, counted
 from xplanes.training.fit import quiet_lightning
 
 
-class FakeAccelerator(Accelerator):
-    """What Lightning asks of a device."""
+class FakeAccelerator(CPUAccelerator):
+    """Takes the device for what it is."""
 
     def setup_device(self, device: torch.device) -> None:
         return
-
-    def teardown(self) -> None:
-        return
-
-    @staticmethod
-    def parse_devices(devices: Any) -> Any:
-        return devices
-
-    @staticmethod
-    def get_parallel_devices(devices: Any) -> list[torch.device]:
-        return [torch.device(NAME, 0)]
-
-    @staticmethod
-    def auto_device_count() -> int:
-        return 1
-
-    @staticmethod
-    def is_available() -> bool:
-        return True
-
-    @staticmethod
-    def name() -> str:
-        return NAME
-
-    def get_device_stats(self, device: Any) -> dict[str, Any]:
-        return {}
 
 
 class StepCounts(Callback):
@@ -52,7 +26,6 @@ class StepCounts(Callback):
         self.steps: list[Counts] = []
 
     def on_train_start(self, trainer: Any, pl_module: Any) -> None:
-        self._before: Counts | None = None
         self._context = counted()
         self._counts = self._context.__enter__()
 
@@ -69,15 +42,9 @@ class StepCounts(Callback):
         self._end()
 
 
-def trainer(callbacks: Any = (), more: Any = (), **options: Any) -> lightning.Trainer:
-    """A Trainer on the device, without logs and files."""
+def trainer(**options: Any) -> lightning.Trainer:
+    """A Trainer on the device, unless the options say otherwise, without logs and files."""
     quiet_lightning()
-    return lightning.Trainer(
-        callbacks=[*callbacks, *more],
-        strategy=SingleDeviceStrategy(torch.device(NAME, 0), accelerator=FakeAccelerator()),
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        **options,
-    )
+    there = SingleDeviceStrategy(torch.device(NAME, 0), accelerator=FakeAccelerator())
+    shown = ("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary")
+    return lightning.Trainer(**{"strategy": there, **dict.fromkeys(shown, False)} | options)

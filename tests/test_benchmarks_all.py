@@ -16,12 +16,13 @@ MODULES = (
 )
 
 
-@pytest.fixture
-def every(monkeypatch):
-    monkeypatch.syspath_prepend(str(FOLDER))
-    monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    yield importlib.import_module("all")
+@pytest.fixture(scope="module")
+def every():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(FOLDER))
+        patch.setenv("OMP_WAIT_POLICY", "PASSIVE")
+        patch.setenv("OMP_NUM_THREADS", "1")
+        yield importlib.import_module("all")
     for name in MODULES:
         sys.modules.pop(name, None)
 

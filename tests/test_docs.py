@@ -33,8 +33,13 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-def test_generated_pages_are_what_the_generator_writes():
-    pages = runpy.run_path(str(ROOT / "docs" / "generate.py"))["PAGES"]
+@pytest.fixture(scope="module")
+def generator() -> dict[str, Any]:
+    return runpy.run_path(str(ROOT / "docs" / "generate.py"))
+
+
+def test_generated_pages_are_what_the_generator_writes(generator):
+    pages = generator["PAGES"]
     notebook = "../examples/first_minute.ipynb"
     assert set(pages) == {"configuration.md", "command_line.md", "api.md", notebook}
     for name, write in pages.items():
@@ -42,8 +47,7 @@ def test_generated_pages_are_what_the_generator_writes():
         assert page == write(), "run: python docs/generate.py"
 
 
-def test_addresses_and_version_are_the_same_wherever_they_stand():
-    generator = runpy.run_path(str(ROOT / "docs" / "generate.py"))
+def test_addresses_and_version_are_the_same_wherever_they_stand(generator):
     addressed = generator["addressed"]
     for name in generator["ADDRESSED"]:
         text = (ROOT / name).read_text(encoding="utf-8")

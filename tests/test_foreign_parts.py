@@ -1,6 +1,5 @@
 """Callbacks, loggers and arguments of Lightning's that do not go with training as it is here."""
 
-import csv
 import warnings
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from lightning.pytorch import callbacks
 from lightning.pytorch.loggers import CSVLogger
 
 from tests.baselines.runs import TINEUVOX, baseline_config
-from tests.training.runs import checkpoint, metrics, small_config
+from tests.training.runs import UNSCORED, checkpoint, metrics, small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError
 from xplanes.files import read_rows
@@ -37,16 +36,21 @@ class Numbers(callbacks.Callback):
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader((folder / "csv" / "metrics.csv").open()))
+    return read_rows(folder / "csv" / "metrics.csv")
+
+
+WRONG_EVERYWHERE = (
+    ({"precision": "64-true"}, r"precision=64-true.*model\.precision"),
+    ({"overfit_batches": 1}, r"overfit_batches=1.*data\.views"),
+)
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"precision": "64-true"}, r"precision=64-true.*model\.precision"),
+        *WRONG_EVERYWHERE,
         ({"precision": "bf16-true"}, r"precision=bf16-true.*model\.precision"),
         ({"precision": "16-mixed"}, r"precision=16-mixed.*model\.precision"),
-        ({"overfit_batches": 1}, r"overfit_batches=1.*data\.views"),
         *(
             ({name: 5, "callbacks": [Evaluation()]}, rf"{name}=5: .*callbacks\.evaluation\.at")
             for name in ("val_check_interval", "check_val_every_n_epoch", "num_sanity_val_steps")
@@ -62,13 +66,7 @@ def test_what_would_train_wrongly_is_refused(options, words):
         Trainer(max_steps=2, **PLAIN, **options)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"precision": "64-true"}, r"precision=64-true.*model\.precision"),
-        ({"overfit_batches": 1}, r"overfit_batches=1.*data\.views"),
-    ],
-)
+@pytest.mark.parametrize(("options", "words"), WRONG_EVERYWHERE)
 def test_a_plain_trainer_that_would_train_wrongly_is_refused(options, words, scenes):
     config = small_config(scenes)
     module, data = RadianceModule(config), SceneDataModule(config["data"])
@@ -94,13 +92,13 @@ def test_averages_of_weights_that_change_their_shapes_are_refused(model, scenes)
     assert trainer.global_step == 0
 
 
-@pytest.mark.parametrize("precision", [None, 32, "32", "32-true"])
-def test_whole_floats_are_accepted(precision):
-    assert Trainer(max_steps=2, precision=precision, **PLAIN).precision == "32-true"
+def test_whole_floats_are_accepted():
+    for precision in (None, 32, "32", "32-true"):
+        assert Trainer(max_steps=2, precision=precision, **PLAIN).precision == "32-true"
 
 
 def test_a_state_that_could_not_be_read_again_is_refused_at_once(scenes, tmp_path):
-    config = small_config(scenes, "trainer.max_steps=4")
+    config = small_config(scenes, "trainer.max_steps=2", UNSCORED)
     config["plugins"] = ["tests.test_foreign_parts"]
     config["callbacks"]["mine"] = {"_target_": "tests.test_foreign_parts.Numbers"}
     with pytest.raises(ConfigError, match=r"callback Numbers.*numpy.*state_dict"):
@@ -115,24 +113,21 @@ def test_a_state_that_could_not_be_read_again_is_refused_at_once(scenes, tmp_pat
 def test_a_resumed_run_goes_on_with_its_csv(scenes, tmp_path):
     options = ("logger=csv", "trainer.log_every_n_steps=2", "callbacks.checkpoints.every=4")
 
-    def train(folder: str, steps: int, *, resume: bool) -> None:
+    def train(steps: int, *, resume: bool) -> None:
         config = small_config(scenes, *options, f"trainer.max_steps={steps}")
         with warnings.catch_warnings():
             warnings.filterwarnings("error", ".*will be deleted.*")
-            run(config, tmp_path / folder, [], resume=resume)
+            run(config, tmp_path, [], resume=resume)
 
-    def steps(folder: str) -> list[int]:
-        return [int(row["step"]) for row in rows(tmp_path / folder) if row["train/loss"]]
-
-    train("parts", 8, resume=False)
-    before = rows(tmp_path / "parts")
+    train(8, resume=False)
+    before = rows(tmp_path)
     # As if it had been killed later than its last checkpoint: these steps are done again.
-    with (tmp_path / "parts" / "csv" / "metrics.csv").open("a") as file:
+    with (tmp_path / "csv" / "metrics.csv").open("a") as file:
         file.write(",".join("9" for _ in before[0]) + "\n")
-    train("parts", 14, resume=True)
-    train("whole", 14, resume=False)
-    assert steps("parts") == steps("whole") == [1, 3, 5, 7, 9, 11, 13]
-    kept = rows(tmp_path / "parts")[: len(before)]
+    train(14, resume=True)
+    found = [int(row["step"]) for row in rows(tmp_path) if row["train/loss"]]
+    assert found == [1, 3, 5, 7, 9, 11, 13]
+    kept = rows(tmp_path)[: len(before)]
     assert [{k: row[k] for k in before[0]} for row in kept][:4] == before[:4]
 
 
@@ -154,7 +149,7 @@ def test_a_row_that_was_cut_off_does_not_end_the_csv(tmp_path, rest):
 
 
 def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(scenes, tmp_path, trained_run):
-    config = small_config(scenes, "trainer.max_steps=40", "data.eval_split=val")
+    config = small_config(scenes, UNSCORED, "data.eval_split=val")
     name = "lightning.pytorch.callbacks.EMAWeightAveraging"
     config["callbacks"]["average"] = {"_target_": name, "decay": 0.98}
     run(config, tmp_path / "run", [], resume=False)
@@ -203,6 +198,8 @@ def test_a_module_that_was_loaded_logs_as_a_fresh_one(scenes, tmp_path):
 
 CALLBACKS = "lightning.pytorch.callbacks"
 THEME = {"_target_": f"{CALLBACKS}.progress.rich_progress.X"}
+BAR = {"_target_": f"{CALLBACKS}.RichProgressBar", "theme": THEME}
+STOP = {"_target_": f"{CALLBACKS}.EarlyStopping", "monitor": "val/pnsr"}
 
 
 @pytest.mark.parametrize(
@@ -210,18 +207,8 @@ THEME = {"_target_": f"{CALLBACKS}.progress.rich_progress.X"}
     [
         ("trainer", "logger", False, r"trainer\.logger=False: set logger=none"),
         ("trainer", "default_root_dir", "x", r"trainer\.default_root_dir=x: set hydra\.run\.dir"),
-        (
-            *("callbacks", "bar", {"_target_": f"{CALLBACKS}.RichProgressBar", "theme": THEME}),
-            r"callbacks\.bar\.theme\._target_=.*plain values.*derive",
-        ),
-        (
-            *(
-                "callbacks",
-                "stop",
-                {"_target_": f"{CALLBACKS}.EarlyStopping", "monitor": "val/pnsr"},
-            ),
-            r"callbacks: EarlyStopping.*val/pnsr",
-        ),
+        ("callbacks", "bar", BAR, r"callbacks\.bar\.theme\._target_=.*plain values.*derive"),
+        ("callbacks", "stop", STOP, r"callbacks: EarlyStopping.*val/pnsr"),
     ],
 )
 def test_settings_that_were_ignored_are_refused(scenes, tmp_path, key, name, value, words):
@@ -232,7 +219,7 @@ def test_settings_that_were_ignored_are_refused(scenes, tmp_path, key, name, val
 
 
 def test_a_logger_may_have_a_folder_of_its_own(scenes, tmp_path):
-    config = small_config(scenes, "logger=csv", "trainer.max_steps=4")
+    config = small_config(scenes, "logger=csv", "trainer.max_steps=1", UNSCORED)
     config["logger"]["csv"]["save_dir"] = str(tmp_path / "elsewhere")
     run(config, tmp_path / "run", [], resume=False)
     assert rows(tmp_path / "elsewhere")

@@ -1,7 +1,6 @@
 """With nothing but Lightning: its own Trainer, loggers, callbacks and checkpoints."""
 
 import copy
-import csv
 import json
 import os
 import re
@@ -19,6 +18,7 @@ from tests.training.runs import same_state, small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError, SceneError
 from xplanes.experiment import Experiment
+from xplanes.files import read_rows
 from xplanes.run import run
 from xplanes.training.building import loss_terms
 from xplanes.training.evaluation import Evaluation
@@ -33,22 +33,18 @@ def config(scenes: Path) -> dict:
     return small_config(scenes, "model.rays.per_batch=1024")
 
 
+PLAIN = {"accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False}
+
+
 def trainer(folder: Path, **options) -> lightning.Trainer:
-    given = {
-        "accelerator": "cpu",
-        "max_steps": 45,
-        "default_root_dir": folder,
-        "logger": CSVLogger(folder, name="", version="csv"),
-        "log_every_n_steps": 5,
-        "enable_progress_bar": False,
-        "enable_model_summary": False,
-    }
+    given = {"max_steps": 45, "default_root_dir": folder, "log_every_n_steps": 5, **PLAIN}
+    given["logger"] = CSVLogger(folder, name="", version="csv")
     return lightning.Trainer(**given | options)
 
 
 def logged(folder: Path) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {}
-    for row in csv.DictReader((folder / "csv" / "metrics.csv").open()):
+    for row in read_rows(folder / "csv" / "metrics.csv"):
         for name, value in row.items():
             if value:
                 found.setdefault(name, []).append(float(value))
@@ -112,48 +108,34 @@ def test_pixels_without_rays_are_background_in_every_score(fitted):
 def test_no_number_of_steps_is_no_limit(tmp_path):
     """Lightning's own Trainer ends after 1000 epochs."""
     options = {"accelerator": "cpu", "default_root_dir": tmp_path, "logger": False}
-    assert Trainer(**options, max_steps=-1, max_seconds=5.0).max_epochs == -1
-    assert Trainer(**options, max_steps=-1, max_seconds=5.0, max_epochs=3).max_epochs == 3
-
-
-def test_a_checkpoint_alone_gives_the_field_back(fitted):
-    folder, _, data, used = fitted
-    path = folder / "last.ckpt"
-    used.save_checkpoint(path)
-    again = RadianceModule.load_from_checkpoint(path)
-    tested = used.test(fitted[1], data, verbose=False)[0]
-    fresh = trainer(folder, logger=False)
-    assert fresh.test(again, SceneDataModule(data.settings), verbose=False)[0] == tested
-
-
-class SaveAt(lightning.Callback):
-    """Writes one checkpoint in the middle of an epoch."""
-
-    def __init__(self, step: int, path: Path) -> None:
-        self.step, self.path = step, path
-
-    def on_train_batch_end(self, trainer, module, *rest) -> None:
-        if trainer.global_step == self.step:
-            trainer.save_checkpoint(self.path)
+    options |= {"max_steps": -1, "max_seconds": 5.0}
+    assert Trainer(**options).max_epochs == -1
+    assert Trainer(**options, max_epochs=3).max_epochs == 3
 
 
 def test_a_resumed_fit_ends_with_the_same_numbers(config, tmp_path):
     path = tmp_path / "half.ckpt"
 
-    def fit(checkpoint: Path | None = None, *callbacks: lightning.Callback) -> dict:
+    class SaveAt13(Callback):
+        """In the middle of an epoch."""
+
+        def on_train_batch_end(self, trainer, *_) -> None:
+            if trainer.global_step == 13:
+                trainer.save_checkpoint(path)
+
+    def fit(checkpoint: Path | None, *callbacks: Callback) -> dict:
         plain = {"logger": False, "enable_checkpointing": False, "limit_val_batches": 0}
-        used = trainer(tmp_path, max_steps=23, callbacks=list(callbacks), **plain)
+        used = trainer(tmp_path, max_steps=16, callbacks=list(callbacks), **plain)
         module = RadianceModule(config)
         used.fit(module, SceneDataModule(config["data"]), ckpt_path=checkpoint)
-        assert used.global_step == 23
+        assert used.global_step == 16
         return module.state_dict()
 
-    whole, resumed = fit(None, SaveAt(13, path)), fit(path)
-    same_state(whole, resumed)
+    same_state(fit(None, SaveAt13()), fit(path))
 
 
 def test_callbacks_that_watch_a_metric_see_every_evaluation(scenes, tmp_path):
-    config = small_config(scenes, "trainer.max_steps=60", "callbacks.evaluation.at=[0,0.2,0.4,0.6]")
+    config = small_config(scenes, "trainer.max_steps=20", "callbacks.evaluation.at=[0,0.2,0.4,0.6]")
     watched = {"monitor": "val/psnr", "mode": "max"}
     stop = {"_target_": f"{CALLBACKS}.EarlyStopping", "patience": 1, "min_delta": 99}
     keep = {"_target_": f"{CALLBACKS}.ModelCheckpoint", "filename": "mine"}
@@ -164,9 +146,9 @@ def test_callbacks_that_watch_a_metric_see_every_evaluation(scenes, tmp_path):
     run(config, tmp_path / "run", [], resume=False)
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     # The evaluation after two fifths of the steps is not 99 dB better than the one before.
-    assert found["step"] == 24
+    assert found["step"] == 8
     kept = torch.load(tmp_path / "mine.ckpt", weights_only=True)
-    assert kept["global_step"] == 24
+    assert kept["global_step"] == 8
 
 
 class Lines(Logger):
@@ -186,8 +168,7 @@ def test_evaluations_join_a_fit_that_builds_the_field(config, tmp_path, limits):
     fit = trainer(tmp_path, **limits, callbacks=[Evaluation(at=[0, 0.5])])
     module, data = RadianceModule(config), SceneDataModule(config["data"])
     fit.fit(module, data)
-    rows = list(csv.DictReader((tmp_path / "curve.csv").open()))
-    assert [row["step"] for row in rows] == ["0", "2", "4"]
+    assert [row["step"] for row in read_rows(tmp_path / "curve.csv")] == ["0", "2", "4"]
 
 
 def test_loggers_need_no_folder(tmp_path):
@@ -198,22 +179,17 @@ def test_loggers_need_no_folder(tmp_path):
     assert type(trainer.logger).__name__ == "Lines"
 
 
-class Steps(lightning.Callback):
-    """Notes what the optimiser is given."""
-
-    def __init__(self) -> None:
-        self.norms: list[float] = []
-
-    def on_before_zero_grad(self, trainer, module, optimizer) -> None:
-        gradients = [p.grad for p in module.parameters() if p.grad is not None]
-        if gradients:
-            self.norms.append(torch.stack([g.norm() for g in gradients]).norm().item())
-
-
 def test_gradients_are_clipped_and_accumulated(config, tmp_path):
     """Regularisers count towards the norm, once for each update."""
-    steps = Steps()
-    options = {"gradient_clip_val": 1e-3, "accumulate_grad_batches": 2, "callbacks": [steps]}
+    norms: list[float] = []
+
+    class Watch(Callback):
+        def on_before_zero_grad(self, trainer, module, optimizer) -> None:
+            gradients = [p.grad.norm() for p in module.parameters() if p.grad is not None]
+            if gradients:
+                norms.append(torch.stack(gradients).norm().item())
+
+    options = {"gradient_clip_val": 1e-3, "accumulate_grad_batches": 2, "callbacks": [Watch()]}
     # The third batch ends the epoch, and hence a step; every second step is logged.
     options |= {"limit_train_batches": 3, "log_every_n_steps": 2}
     used = trainer(tmp_path, max_steps=4, limit_val_batches=0, **options)
@@ -221,29 +197,25 @@ def test_gradients_are_clipped_and_accumulated(config, tmp_path):
     used.fit(module, SceneDataModule(config["data"]))
     assert (used.global_step, module.batches) == (4, 6)
     assert len(logged(tmp_path)["train/loss"]) == 2
-    assert max(steps.norms) < 1.001e-3
+    assert max(norms) < 1.001e-3
     assert module.tally.last["loss"] > 0
 
 
-class BreaksOff(lightning.Callback):
-    """Notes learning rates, and fails in the first step."""
-
-    def __init__(self) -> None:
-        self.rates: list[float] = []
-
-    def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
-        self.rates.append(optimizer.param_groups[0]["lr"])
-        if len(self.rates) == 1:
-            raise RuntimeError("a fault of one's own")
-
-
 def test_a_fit_after_one_that_was_broken_off_begins_with_low_rates(config, tmp_path):
-    module, data, steps = RadianceModule(config), SceneDataModule(config["data"]), BreaksOff()
-    options = {"logger": False, "limit_val_batches": 0, "callbacks": [steps]}
+    rates: list[float] = []
+
+    class BreaksOff(Callback):
+        def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
+            rates.append(optimizer.param_groups[0]["lr"])
+            if len(rates) == 1:
+                raise RuntimeError("a fault of one's own")
+
+    module, data = RadianceModule(config), SceneDataModule(config["data"])
+    options = {"logger": False, "limit_val_batches": 0, "callbacks": [BreaksOff()]}
     with pytest.raises(RuntimeError, match="a fault of one's own"):
         trainer(tmp_path, **options).fit(module, data)
     trainer(tmp_path, **options | {"max_steps": 2}).fit(module, data)
-    assert steps.rates[0] == steps.rates[1] < steps.rates[2]
+    assert rates[0] == rates[1] < rates[2]
 
 
 def test_two_halves_of_a_batch_make_the_same_step_as_the_whole(config):

@@ -1,6 +1,5 @@
 """Models, samplers, data formats and losses from outside the package, chosen by configuration."""
 
-import csv
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -18,6 +17,7 @@ from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.fields.base import RadianceField
+from xplanes.files import read_rows
 from xplanes.run import run
 from xplanes.scenes.source import SceneSettings
 from xplanes.tools.runs import load_run
@@ -57,7 +57,7 @@ def config(tmp_path: Path) -> dict:
 
 def psnr_at_the_ends(folder: Path) -> tuple[float, float]:
     """PSNR before the first step, and at the end."""
-    curve = list(csv.DictReader((folder / "curve.csv").open()))
+    curve = read_rows(folder / "curve.csv")
     return float(curve[0]["psnr"]), float(curve[-1]["psnr"])
 
 
@@ -66,7 +66,7 @@ def test_all_four_train_log_and_load_again(config, tmp_path):
     run(config, folder, [], resume=False)
     first, last = psnr_at_the_ends(folder)
     assert last > first + 1
-    logged = list(csv.DictReader((folder / "csv" / "metrics.csv").open()))
+    logged = read_rows(folder / "csv" / "metrics.csv")
     opacity = [float(row["train/opacity"]) for row in logged if row.get("train/opacity")]
     assert opacity[0] > opacity[-1] > 0
     trained = load_run(folder, plugins=["tests.plugins"])
@@ -138,12 +138,13 @@ def test_classes_that_may_not_stand_there_are_refused(config, tmp_path, target, 
 
 
 def test_settings_of_plugins_are_checked_alike(config, tmp_path):
-    config["model"]["width"] = -1.0
-    with pytest.raises(ConfigError, match=r"model\.width=-1\.0: must be above 0"):
-        run(config, tmp_path / "run", [], resume=False)
-    config["model"] |= {"width": 1, "widht": 2}
-    with pytest.raises(ConfigError, match=r"model\.widht: there is no such .* mean width"):
-        run(config, tmp_path / "run", [], resume=False)
+    for changes, words in (
+        ({"width": -1.0}, r"model\.width=-1\.0: must be above 0"),
+        ({"width": 1, "widht": 2}, r"model\.widht: there is no such .* mean width"),
+    ):
+        config["model"] |= changes
+        with pytest.raises(ConfigError, match=words):
+            run(config, tmp_path / "run", [], resume=False)
 
 
 def test_a_module_that_is_not_there_is_said(config, tmp_path):
@@ -183,12 +184,6 @@ def example(
         del sys.modules[name]
 
 
-@pytest.fixture
-def small_model(example: Callable[..., dict]) -> dict:
-    """The configuration of the docs' model."""
-    return example("A model", "model", "mlp", "trainer.max_steps=60")
-
-
 def test_the_lrm_of_the_docs_initialises_a_field(example, tmp_path):
     changes = ("preparation.cache=null", "preparation.frames=4", "trainer.max_steps=2")
     own = example("A Large Reconstruction Model", "lrm", "cardboard", *changes)
@@ -203,9 +198,10 @@ def test_the_lrm_of_the_docs_initialises_a_field(example, tmp_path):
     assert own_psnr > random_psnr + 1
 
 
-def test_the_model_of_the_docs_trains(small_model, tmp_path):
-    assert small_model["lrm"]["name"] == "none"
-    run(small_model, tmp_path / "run", [], resume=False)
+def test_the_model_of_the_docs_trains(example, tmp_path):
+    own = example("A model", "model", "mlp", "trainer.max_steps=60")
+    assert own["lrm"]["name"] == "none"
+    run(own, tmp_path / "run", [], resume=False)
     first, last = psnr_at_the_ends(tmp_path / "run")
     assert last > first + 1
     field = load_run(tmp_path / "run", plugins=["my_package"]).module.field
@@ -246,11 +242,12 @@ GROUPS = (
 )
 
 
-def test_models_that_cannot_be_trained_are_refused_when_they_are_built(small_model, monkeypatch):
-    scene = SceneDataModule(small_model["data"]).scene
+def test_models_that_cannot_be_trained_are_refused_when_they_are_built(example, monkeypatch):
+    own = example("A model", "model", "mlp")
+    scene = SceneDataModule(own["data"]).scene
 
     def build_one() -> None:
-        RadianceModule(small_model, plugins=["my_package"]).build(scene)
+        RadianceModule(own, plugins=["my_package"]).build(scene)
 
     build_one()
     model = sys.modules["my_package.mlp"].MLPModel

@@ -1,17 +1,17 @@
 """A sweep from the command line to its table."""
 
-import csv
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from hydra.types import RunMode
+from omegaconf import OmegaConf
 
 from tests.inside import train
 from tests.tools.test_sheet import areas, pictured
 from tests.training.runs import SMALL
+from xplanes.files import read_rows
 from xplanes.tools.table import SweepTable, choose_gpu
 
 CHANGED = ("model.channels", "trainer.max_steps", "callbacks.evaluation.at")
@@ -26,8 +26,7 @@ def test_a_failed_job_is_a_row_and_the_others_go_on(scenes, tmp_path):
         cwd=tmp_path,
         code=1,
     )
-    with (tmp_path / "table.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(tmp_path / "table.csv")
     assert [row["model.channels"] for row in rows] == ["0", "4"]
     assert [row["status"].split(":")[0] for row in rows] == ["failed", "finished"]
     assert "model.channels=0" in rows[0]["status"]
@@ -39,15 +38,11 @@ def test_a_failed_job_is_a_row_and_the_others_go_on(scenes, tmp_path):
 
 def swept(folder: Path, **options: Any) -> SweepTable:
     """The callback of a sweep whose jobs are done."""
-    hydra = SimpleNamespace(
-        mode=RunMode.MULTIRUN,
-        job=SimpleNamespace(num=3),
-        runtime=SimpleNamespace(output_dir=str(folder)),
-        sweep=SimpleNamespace(dir=str(folder)),
-    )
-    callback, settings = SweepTable(**options), SimpleNamespace(hydra=hydra)
-    callback.on_multirun_start(settings)  # type: ignore[arg-type]
-    callback.on_multirun_end(settings)  # type: ignore[arg-type]
+    runtime, place = {"output_dir": str(folder)}, {"dir": str(folder)}
+    hydra = {"mode": RunMode.MULTIRUN, "job": {"num": 3}, "runtime": runtime, "sweep": place}
+    callback, settings = SweepTable(**options), OmegaConf.create({"hydra": hydra})
+    callback.on_multirun_start(settings)
+    callback.on_multirun_end(settings)
     return callback
 
 

@@ -11,7 +11,7 @@ from lightning.pytorch import callbacks
 from lightning.pytorch.loggers import CSVLogger
 
 from tests.baselines.runs import TINEUVOX, baseline_config
-from tests.training.runs import UNSCORED, checkpoint, metrics, small_config
+from tests.training.runs import NO_CURVE, checkpoint, metrics, small_config
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError
 from xplanes.files import read_rows
@@ -98,7 +98,7 @@ def test_whole_floats_are_accepted():
 
 
 def test_a_state_that_could_not_be_read_again_is_refused_at_once(scenes, tmp_path):
-    config = small_config(scenes, "trainer.max_steps=2", UNSCORED)
+    config = small_config(scenes, "trainer.max_steps=2", NO_CURVE)
     config["plugins"] = ["tests.test_foreign_parts"]
     config["callbacks"]["mine"] = {"_target_": "tests.test_foreign_parts.Numbers"}
     with pytest.raises(ConfigError, match=r"callback Numbers.*numpy.*state_dict"):
@@ -149,7 +149,7 @@ def test_a_row_that_was_cut_off_does_not_end_the_csv(tmp_path, rest):
 
 
 def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(scenes, tmp_path, trained_run):
-    config = small_config(scenes, UNSCORED, "data.eval_split=val")
+    config = small_config(scenes, NO_CURVE, "data.eval_split=val")
     name = "lightning.pytorch.callbacks.EMAWeightAveraging"
     config["callbacks"]["average"] = {"_target_": name, "decay": 0.98}
     run(config, tmp_path / "run", [], resume=False)
@@ -219,7 +219,7 @@ def test_settings_that_were_ignored_are_refused(scenes, tmp_path, key, name, val
 
 
 def test_a_logger_may_have_a_folder_of_its_own(scenes, tmp_path):
-    config = small_config(scenes, "logger=csv", "trainer.max_steps=1", UNSCORED)
+    config = small_config(scenes, "logger=csv", "trainer.max_steps=1", NO_CURVE)
     config["logger"]["csv"]["save_dir"] = str(tmp_path / "elsewhere")
     run(config, tmp_path / "run", [], resume=False)
     assert rows(tmp_path / "elsewhere")

@@ -16,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from hydra_plugins.xplanes import ALIASES
 from tests import inside
-from tests.training.runs import SMALL, UNSCORED, metrics, small_config, status
+from tests.training.runs import NO_CURVE, SMALL, metrics, small_config, status
 from tests.warm import forked
 from xplanes import config as config_module
 from xplanes.cli import main
@@ -213,7 +213,7 @@ def test_a_run_of_an_earlier_version_is_refused_with_its_version(tmp_path):
 def test_a_run_that_failed_before_its_first_checkpoint_blocks_nothing(
     scenes, tmp_path, monkeypatch
 ):
-    config = small_config(scenes, "trainer.max_steps=1", UNSCORED)
+    config = small_config(scenes, "trainer.max_steps=1", NO_CURVE)
     monkeypatch.setattr(RadianceModule, "training_step", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run(config, tmp_path / "run", [], resume=False)

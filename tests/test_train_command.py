@@ -20,8 +20,8 @@ from omegaconf import DictConfig, OmegaConf
 from hydra_plugins.xplanes import file_name
 from tests import inside
 from tests.training.runs import (
+    NO_CURVE,
     SMALL,
-    UNSCORED,
     after_each_batch,
     checkpoint,
     metrics,
@@ -43,7 +43,7 @@ from xplanes.scenes.colmap import ColmapSettings
 ROOT = Path(__file__).resolve().parent.parent
 
 
-SHORT = (*(text for text in SMALL if "max_steps" not in text), UNSCORED)
+SHORT = (*(text for text in SMALL if "max_steps" not in text), NO_CURVE)
 """Settings of a small run without its number of steps."""
 
 
@@ -422,7 +422,7 @@ def test_a_run_is_alone_in_its_folder_and_ctrl_c_saves_it(root, tmp_path, monkey
             signal.raise_signal(signal.SIGINT)
 
     after_each_batch(monkeypatch, look_and_stop)
-    inside.train(root, *SMALL, UNSCORED, f"hydra.run.dir={run}", code=130)
+    inside.train(root, *SMALL, NO_CURVE, f"hydra.run.dir={run}", code=130)
     assert status(run)["status"] == "interrupted"
     assert checkpoint(run)["global_step"] == 3
     with alone_in(run):

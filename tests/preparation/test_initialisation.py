@@ -11,7 +11,7 @@ import torch
 from tests.balls import ball_scene
 from tests.preparation.sequences import OPTIONS, blob, moving_sequence, static_features
 from tests.refusals import assert_refused
-from tests.training.runs import UNSCORED, same_state, small_config
+from tests.training.runs import NO_CURVE, same_state, small_config
 from xplanes import run
 from xplanes.decomposition import unexplained_energy
 from xplanes.errors import ConfigError
@@ -249,7 +249,7 @@ def test_the_video_of_a_run_shows_the_field_in_its_own_frame(scenes, tmp_path, m
 
     monkeypatch.setattr(render, "render_path", note)
     monkeypatch.setattr(render, "FRAMES", 2)
-    source = ("lrm=file", f"lrm.triplanes={tmp_path}/a.pt", "preparation.cache=null", UNSCORED)
+    source = ("lrm=file", f"lrm.triplanes={tmp_path}/a.pt", "preparation.cache=null", NO_CURVE)
     plain = small_config(scenes, *source, "trainer.max_steps=1", "media=true", "logger=none")
     run.run(plain, tmp_path / "run", [], resume=False)
     (found,) = shown

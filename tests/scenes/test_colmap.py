@@ -492,12 +492,6 @@ def test_truncated_binary_files(tmp_path):
         for count, words in ((1, "bytes follow the 1"), (2**62, f"of {2**62}")):
             (folder / name).write_bytes(struct.pack("<Q", count) + whole[8:])
             refused(read, words, str(folder / name), case=count)
-        (folder / name).write_bytes(whole)
-    whole = (PYCOLMAP / "cameras.bin").read_bytes()
-    (tmp_path / "cameras.bin" / "cameras.bin").write_bytes(
-        whole[:12] + struct.pack("<i", 17) + whole[16:]
-    )
-    refused(partial(read_model, tmp_path / "cameras.bin"), "camera model EQUIRECTANGULAR")
 
 
 @pytest.mark.parametrize(
@@ -546,10 +540,12 @@ def test_lines_of_points_may_be_missing(tmp_path):
     ("camera", "lens", "words"),
     [
         (5, CAMERA[1], "frame_000.png was taken by camera 5, which cameras.bin does not list"),
-        (1, (11, 4, 3, (1.0,) * 16), r"cameras\.bin: .*model number 11.*These are: SIMPLE_PINH"),
+        (1, (11, 4, 3, (1.0,) * 16), r"cameras\.bin: .*model RAD_TAN_.*These are: SIMPLE_PINHOLE"),
+        (1, (17, 4, 3, (1.0, 1.0)), "model EQUIRECTANGULAR.*cut perspective images"),
+        (1, (99, 4, 3, (1.0,) * 16), "model number 99"),
         (1, ("FOV", 40, 30, (9.0, 9.0, 1.0, 1.0, 4.0)), "omega=4.0; it must lie between 0 and pi"),
     ],
-    ids=["unknown camera", "unknown model", "lens that cannot be"],
+    ids=["unknown camera", "unread", "panorama", "unknown model", "lens that cannot be"],
 )
 def test_cameras_that_cannot_be(capture, camera, lens, words):
     capture.write({1: lens}, camera)

@@ -48,7 +48,8 @@ SMALL = (
     "media=false",
 )
 
-UNSCORED = ("callbacks.evaluation.at=[]", "data.eval_views=1", "logger=none")
+NO_CURVE = "callbacks.evaluation.at=[]"
+UNSCORED = (NO_CURVE, "data.eval_views=1", "logger=none")
 """Training alone is looked at."""
 
 

@@ -9,7 +9,15 @@ import torch
 from PIL import Image
 
 from tests.preparation.sequences import OPTIONS, moving_sequence
-from tests.training.runs import UNSCORED, broken_off, checkpoint, metrics, same_state, small_config
+from tests.training.runs import (
+    NO_CURVE,
+    UNSCORED,
+    broken_off,
+    checkpoint,
+    metrics,
+    same_state,
+    small_config,
+)
 from xplanes.decomposition import decompose, unexplained_energy
 from xplanes.decomposition.conversion import frame_profiles
 from xplanes.errors import ConfigError
@@ -289,7 +297,7 @@ def test_a_run_from_one_triplane_is_loaded_too(train, tmp_path):
 def test_triplanes_of_a_trained_field_initialise_a_field_with_equal_renders(train, tmp_path):
     """Checks end to end that orientation, time, decoder and frame of a file match the field's."""
     common = ("model=nine_planes", "model.precision=32")
-    trained = train(*common, "trainer.max_steps=30", UNSCORED[0], name="first")
+    trained = train(*common, "trainer.max_steps=30", NO_CURVE, name="first")
     first = load_run(trained)
     field, options = first.module.field, first.experiment.method.model.decoder
     with torch.no_grad():

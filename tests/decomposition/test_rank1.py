@@ -129,3 +129,11 @@ def test_six_planes_need_square_triplanes():
         time_planes(oblong, plane_set="six", resolution=4)
     # Nine share none, so that each plane has its own axis.
     assert time_planes(oblong, plane_set="nine", resolution=4).shape == (6, 2, 4, 1)
+
+
+def test_signs_do_not_jump_between_frames():
+    rows = torch.tensor([[1, -1.1], [1.1, -1], [1, -1.1]], dtype=torch.float64)
+    planes = rows[:, None, :, None] * torch.arange(1.0, 6, dtype=torch.float64)
+    wide, tall = rank1_factors(planes)
+    alike = (wide[1:] * wide[:-1]).sum(dim=1) + (tall[1:] * tall[:-1]).sum(dim=1)
+    assert (alike > 0).all()

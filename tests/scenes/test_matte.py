@@ -78,6 +78,8 @@ def test_faint_alpha_is_no_silhouette_beside_something_opaque():
     assert silhouette_of(torch.full_like(alpha, 255)).all()
     assert not silhouette_of(torch.zeros_like(alpha)).any()
     assert not silhouette_of(torch.full_like(alpha, FAINT - 1)).any()
+    alpha[3] = 32  # A wire of an eighth of a pixel.
+    assert silhouette_of(alpha)[3].all()
 
 
 def test_what_is_faint_all_over_is_kept_without_its_noise():

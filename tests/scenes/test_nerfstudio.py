@@ -446,7 +446,8 @@ def test_a_colour_may_be_transparent(capture, level):
         pixels = capture.views.image(index).numpy()
         pixels = np.where(pixels[..., 3:] > 0, pixels[..., :3].clip(1, 254), level)
         save(capture.image(index), pixels.astype(np.uint8))
-    capture.change(**{"white_transparent" if level else "black_transparent": True})
+    chosen, other = ("white", "black") if level else ("black", "white")
+    capture.change(**{f"{chosen}_transparent": "true", f"{other}_transparent": "False"})
     found = capture.all()
     assert torch.equal(found.images[..., 3], expected.images[..., 3])
     assert (found.images.short() - expected.images.short()).abs().max() <= 1

@@ -177,7 +177,8 @@ def _recognised(folder: Path, changed: Sequence[str]) -> tuple[Path, str]:
     scenes = f" Scenes inside it: {', '.join(inside)}." if inside else ""
     packed = sorted(path.name for path in folder.iterdir() if path.suffix in ARCHIVES)
     unpack = f" Unpack {some(packed)} first." if packed else ""
-    others = sorted(path.name for path in folder.glob("transforms_*.json"))
+    splits = {f"transforms_{split}.json" for split in ("train", "val", "test")}
+    others = sorted({path.name for path in folder.glob("transforms_*.json")} - splits)
     join = f" Join the frames of {some(others)} in a transforms.json." if others else ""
     there = [f"{path.name}{'/' * path.is_dir()}" for path in folder.iterdir()]
     wanted = "; ".join(f"{name}: {cls.files}" for cls, name in known.items() if cls.files)

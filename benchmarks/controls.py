@@ -26,7 +26,7 @@ from xplanes.streams import Stream, step_generator
 from xplanes.synthetic.demo.render import camera_at, render_image
 from xplanes.synthetic.demo.scenes import build_demo_scene, demo_scene
 from xplanes.synthetic.pretraining.objects import procedural_object
-from xplanes.synthetic.pretraining.pool import camera, render_solids, view_cameras
+from xplanes.synthetic.pretraining.pool import render_solids, view_cameras
 
 OBJECTS = 64
 """Objects of the LRM's training set whose mean triplane is a control."""
@@ -135,7 +135,7 @@ def training_mean(lrm: LoadedLRM) -> Tensor:
     """Mean of the LRM's triplanes of objects that it was trained on. [1, 3, C, H, H]"""
     side, pictures = lrm.model.image_size, []
     for seed in range(OBJECTS):
-        pose = camera(*view_cameras(seed, 4)[0])
+        pose = camera_at(*view_cameras(seed, 4)[0]).numpy()
         pictures.append(torch.from_numpy(render_solids(procedural_object(seed), pose, side)[0]))
     return _encoded(lrm, pictures).mean(dim=0, keepdim=True)
 

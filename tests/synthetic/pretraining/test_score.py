@@ -12,9 +12,10 @@ from tests.synthetic.pretraining.test_solids import one
 from xplanes.cli import main
 from xplanes.fields.decoder import Decoder
 from xplanes.lrm.canonical import OPENLRM_VIEW, CanonicalView
+from xplanes.synthetic.demo.render import camera_at
 from xplanes.synthetic.pretraining import score as score_module
 from xplanes.synthetic.pretraining.initialisation import init_model
-from xplanes.synthetic.pretraining.pool import FOCAL, camera, inside, render_solids
+from xplanes.synthetic.pretraining.pool import FOCAL, inside, render_solids
 from xplanes.synthetic.pretraining.quick import QuickLook, overlap, world_to_model
 from xplanes.synthetic.pretraining.score import Subject, demo_subjects, held_out, score, score_all
 from xplanes.synthetic.pretraining.solids import BOX
@@ -56,7 +57,7 @@ def test_a_model_that_knows_the_answer_scores_high():
     light = [0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0]
     solids = one(BOX, light=light).moved(0.9, np.array([0.2, -0.1, 0.15]))
     solids.numbers[:] = 0  # one even colour
-    poses = [camera(*at) for at in ((20, 15), (110, 40), (-60, 5))]
+    poses = [camera_at(*at).numpy() for at in ((20, 15), (110, 40), (-60, 5))]
     colour = solids.paints[0, 0].tolist()
     subject = Subject(
         "box",

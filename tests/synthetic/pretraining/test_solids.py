@@ -6,7 +6,7 @@ import torch
 
 from tests.synthetic.rays import rays
 from xplanes.scenes.cameras import cast_rays
-from xplanes.synthetic.demo.render import render_image
+from xplanes.synthetic.demo.render import camera_at, render_image
 from xplanes.synthetic.demo.scenes import DEMO_SCENES, build_demo_scene
 from xplanes.synthetic.pretraining.objects import (
     HELD_OUT_SEEDS,
@@ -14,7 +14,7 @@ from xplanes.synthetic.pretraining.objects import (
     TRAINING_SEEDS,
     procedural_object,
 )
-from xplanes.synthetic.pretraining.pool import FOCAL, camera, cast, inside, render_solids
+from xplanes.synthetic.pretraining.pool import FOCAL, cast, inside, render_solids
 from xplanes.synthetic.pretraining.solids import (
     BOX,
     CAPSULE,
@@ -76,7 +76,7 @@ def test_occupancy_agrees():
 
 def test_images_agree_with_the_demo_renderer():
     solids = procedural_object(5)
-    pose = camera(30, 25)
+    pose = camera_at(30, 25).numpy()
     colour, alpha, depth = render_solids(solids, pose, 48)
     truth = render_image(solids.posed(), torch.from_numpy(pose), 48).astype(np.float64) / 255
     on_white = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]

@@ -29,11 +29,6 @@ FOCAL = 0.5 / math.tan(0.5 * CAMERA_ANGLE_X)
 """Focal length of D-NeRF's cameras as a share of the image side."""
 
 
-def camera(azimuth: float, elevation: float) -> Array:
-    """Pose of a camera that faces the origin, at D-NeRF's distance; degrees. [4, 4]"""
-    return camera_at(azimuth, elevation).numpy()
-
-
 def render_solids(
     solids: Solids, pose: Array, side: int, samples: int = 2
 ) -> tuple[Array, Array, Array]:
@@ -124,7 +119,7 @@ def draw_sample(seed: int, views: int, side: int) -> NDArray:
     solids, random = procedural_object(seed), np.random.default_rng([STREAM, seed])
     record = np.zeros(1, sample_type(views, side))
     for view, (azimuth, elevation) in enumerate(_cameras(random, views)):
-        pose = camera(azimuth, elevation)
+        pose = camera_at(azimuth, elevation).numpy()
         colour, alpha, depth = render_solids(solids, pose, side)
         record["pictures"][0, view, ..., :3] = np.rint(255 * colour)
         record["pictures"][0, view, ..., 3] = np.rint(255 * alpha)

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
@@ -17,7 +16,7 @@ from xplanes.synthetic.demo.render import camera_at, render_image
 from xplanes.synthetic.demo.scenes import DEMO_SCENES, build_demo_scene
 from xplanes.synthetic.pretraining.losses import triplane_logits
 from xplanes.synthetic.pretraining.objects import HELD_OUT_SEEDS, procedural_object
-from xplanes.synthetic.pretraining.pool import FOCAL, camera, inside, render_solids, view_cameras
+from xplanes.synthetic.pretraining.pool import FOCAL, inside, render_solids, view_cameras
 from xplanes.synthetic.pretraining.quick import model_pose, overlap, world_to_model
 from xplanes.synthetic.pretraining.render import render_view
 
@@ -55,7 +54,7 @@ def held_out(count: int) -> Iterator[Subject]:
         solids = procedural_object(seed)
         yield Subject(
             f"object {seed - HELD_OUT_SEEDS.start}",
-            torch.from_numpy(np.stack([camera(*at) for at in view_cameras(seed, 4)])),
+            torch.stack([camera_at(*at) for at in view_cameras(seed, 4)]),
             lambda pose, side, s=solids: torch.from_numpy(render_solids(s, pose.numpy(), side)[0]),
             lambda points, s=solids: torch.from_numpy(inside(s, points.double().numpy())),
         )

@@ -82,6 +82,7 @@ def trained_once():
         with fake_device.counted() as counts:
             # The share lets each step know how well it shows what is not background.
             found = trained(name, STEPS[name], *SHARE.get(name, ()), watch=[clock])
+        found[0].to(torch.device(fake_device.NAME, 0)).zero_grad(set_to_none=True)
         return *found, clock, counts
 
     return train
@@ -253,7 +254,6 @@ def test_warming_up_does_all_of_a_step_and_changes_nothing(fake_gpu, trained_onc
     images = Mock(side_effect=AssertionError("images may take all memory"))
     monkeypatch.setattr(Views, "__deepcopy__", images, raising=False)
     before = {name: value.cpu().clone() for name, value in module.state_dict().items()}
-    module.zero_grad(set_to_none=True)
     with fake_device.counted() as counts:
         warm_up_loops(module, data, fake_gpu)
     for name in ("_fused_adam_", "scatter_reduce_", "grid_sampler_2d_backward"):
@@ -348,7 +348,6 @@ def test_steps_keep_to_their_budget_and_views_are_scored(fake_gpu, trained_once,
     assert clock.seconds > 0
     assert whole.waits["synchronize"] == 1  # At the end alone.
     assert all(p.isfinite().all() for p in module.parameters())
-    module.to(fake_gpu)
     views, background = data.scene.splits["test"], data.scene.background
     score, images = score_view(module.field, module.renderer, module.frame, views, 0, background)
     assert 0 < score.psnr < 60

@@ -94,12 +94,15 @@ def test_all_timesteps_are_rendered_and_steps_alone_may_limit_training(
     assert made.description == "7 frames rendered by six_planes trained for 60 steps"
 
 
-@pytest.mark.parametrize("wanted", [True, False])
-def test_it_leaves_the_run_as_deterministic_as_it_was(tmp_path, small_fields, wanted):
+@pytest.mark.parametrize(("wanted", "model"), [(True, "six_planes"), (False, "kplanes")])
+def test_it_leaves_the_run_as_deterministic_as_it_was(tmp_path, small_fields, wanted, model):
+    options = (f"preparation.fixed_view_model={model}", "preparation.fixed_view_steps=1")
     before = torch.are_deterministic_algorithms_enabled()
     try:
         torch.use_deterministic_algorithms(wanted)
-        video_of(settings(tmp_path, "preparation.fixed_view_steps=1"), ball_scene(), None, size=4)
+        made, said = video_of(settings(tmp_path, *options), ball_scene(), None, size=4)
+        assert f"training {model} for up to 1 steps" in said[0]
+        assert made.views.images.any()
         assert torch.are_deterministic_algorithms_enabled() == wanted
     finally:
         torch.use_deterministic_algorithms(before)

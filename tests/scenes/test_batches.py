@@ -167,6 +167,9 @@ def test_pixels_of_each_kind_are_drawn_alike_and_have_the_share_asked_for(kind, 
     assert np.array_equal(
         batch["times"], views.times.numpy()[pixel // (views.height * views.width)]
     )
+    moved = batches_of(views, seed=7, rank=2, background_jitter=0.2, **options).draw(11)
+    shown = batch["alpha"] > 0
+    assert torch.equal(moved["times"][shown], batch["times"][shown])
 
 
 def test_only_rays_far_from_silhouettes_move_in_time_and_not_far():

@@ -218,6 +218,20 @@ def test_update_empties_an_empty_grid_and_finds_what_appears():
     assert grid.occupied_fraction == 1
 
 
+@pytest.mark.parametrize("live", [None, torch.ones(128, dtype=torch.bool)])
+def test_kept_cells_never_empty_unless_they_are_ruled_out(live):
+    grid, draw = grid_of(), generator()
+    kept, allowed = (torch.rand(2, 2, 4, 4, 4, generator=draw) < 0.5).unbind(dim=0)
+    grid.allow(allowed)
+    grid.keep(kept)
+    for seed in range(20):
+        grid.observe(torch.arange(128), torch.zeros(128), live)
+        update(grid, Even(0.0), seed, by_numbers=live is not None)
+        grid.sweep(Even(0.0), draw)
+    assert torch.equal(grid.occupied, (kept & allowed).flatten())
+    assert torch.equal(grid.at(0.7).occupied, (kept & allowed)[1].flatten())
+
+
 def test_cells_that_are_ruled_out_never_fill():
     grid = grid_of()
     allowed = torch.rand(2, 4, 4, 4, generator=generator()) < 0.5

@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from tests.balls import ball_views, surrounding, swinging
+from tests.balls import ball_views, inside_ball, surrounding, swinging
 from tests.training.runs import changed
 from xplanes.components import build
 from xplanes.models.base import ModelSettings
+from xplanes.rendering.occupancy import OccupancyGrid
+from xplanes.rendering.pruning import keep_moving
 from xplanes.rendering.sampler import time_rows
 from xplanes.scenes.batches import STATIC_SHARE, RayBatches
-from xplanes.scenes.frame import scene_frame
-from xplanes.scenes.silhouettes import CHANGE, changing
+from xplanes.scenes.frame import cube_frame, scene_frame
+from xplanes.scenes.silhouettes import CHANGE, changing, moving
 
 FRAMES, CAMERAS, SIZE = 7, 3, 30
 
@@ -54,6 +56,62 @@ def test_cameras_that_move_or_show_nothing_that_changes_are_left_alone():
     static = replace(views, images=views.images[:1].expand_as(views.images).contiguous())
     assert changing(static, [0] * len(views)) is None
     assert changing(views.subset(torch.arange(2 * CAMERAS)), [0] * 2 * CAMERAS) is None
+
+
+def moving_in(views, points, **how):
+    bins = (views.times * (FRAMES - 1)).round().long()
+    return moving(views, points, **{"radius": 0.05, "bins": bins, **how})
+
+
+def test_what_moves_lies_where_every_fixed_camera_sees_a_change():
+    views, _ = rig()
+    anywhere = 2.8 * torch.rand(20000, 3, generator=torch.Generator().manual_seed(0)) - 1.4
+    for frame in range(FRAMES):
+        centre = swinging(0.8, 0.8)(frame / (FRAMES - 1))
+        found = moving_in(views, centre + inside_ball(500, 0.25))
+        assert found is not None
+        assert found[frame].float().mean() > 0.97
+        found = moving_in(views, anywhere)
+        away = (anywhere - centre).norm(dim=1) > 0.8
+        assert found[frame, away].float().mean() < 0.03
+        # Half the pixels show the same, and the images of a bin together show at least as much.
+        coarse = moving_in(views, centre + inside_ball(500, 0.25), stride=2)
+        assert coarse[frame].float().mean() > 0.97
+    together = moving_in(views, anywhere, bins=torch.zeros(len(views), dtype=torch.int64))
+    assert together[0, found.any(dim=0)].all()
+    assert together[0].float().mean() < 0.3
+
+
+def test_one_camera_does_not_tell_where_something_moves():
+    views, _ = rig()
+    points = inside_ball(2000, 1.4)
+    assert moving_in(views.subset(torch.arange(0, len(views), CAMERAS)), points) is None
+    moved = views.camera_to_world + 1e-3 * torch.rand(len(views), 1, 1)
+    assert moving_in(replace(views, camera_to_world=moved), points) is None
+    # One camera looks away: where the others alone see a change is enough.
+    poses = views.camera_to_world.clone()
+    poses[::CAMERAS, :3, 3] += 100
+    found = moving_in(replace(views, camera_to_world=poses), points)
+    assert found.any()
+
+
+def test_cells_in_which_something_moves_stay_occupied():
+    views, _ = rig()
+    frame = cube_frame(1.4, torch.zeros(3))
+    grid = OccupancyGrid(16, FRAMES, step=0.05)
+    keep_moving(grid, views, frame)
+    cells = torch.arange(len(grid.density))
+    for _ in range(100):
+        grid.observe(cells, torch.zeros(len(cells)))
+    assert 0.01 < grid.occupied_fraction < 0.1
+    for time in views.times.unique():
+        inside = frame.points(inside_ball(500, 0.25) + swinging(0.8, 0.8)(float(time)))
+        found = grid.occupied[grid.cells(inside, time.expand(500))]
+        assert found.float().mean() > 0.97
+    transparent = ball_views(6, 0.5, poses=views.camera_to_world[:1].expand(6, 4, 4), size=SIZE)
+    grid = OccupancyGrid(16, FRAMES, step=0.05)
+    keep_moving(grid, transparent, frame)
+    assert not grid.kept.any()
 
 
 def test_rays_see_more_of_what_changes_and_all_of_the_rest():

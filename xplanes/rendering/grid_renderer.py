@@ -18,7 +18,7 @@ from xplanes.rendering.compositing import composite, distortion
 from xplanes.rendering.front_to_back import front_to_back
 from xplanes.rendering.marching import Rays, march
 from xplanes.rendering.occupancy import OccupancyGrid
-from xplanes.rendering.pruning import carve, fill
+from xplanes.rendering.pruning import carve, fill, keep_moving
 from xplanes.rendering.sampler import VIEWS_PER_ROW, Sampler, SamplerSettings, Site
 from xplanes.rendering.thinning import thinned
 from xplanes.rendering.warming import render_one_ray
@@ -235,7 +235,8 @@ class OccupancySettings(SamplerSettings):
     skip_occluded: bool  # Skip samples behind opaque surfaces.
     occlusion: Annotated[float, Range(0, 1)]  # Transmittance below which samples are occluded.
     thinning: Weight  # Subsample gradients below this times the mean, on the CPU; 0: off.
-    silhouettes: bool  # Prune cells outside the silhouettes (alpha).
+    # Prune cells outside the silhouettes (alpha); keep those in which all fixed cameras see motion.
+    silhouettes: bool
     fill: bool  # Prune empty cells of an initialised field.
     # Weight of the mean opacity per step of random points in occupied cells. It empties space that
     # no training ray sees, such as that below a ground plate. 0 if a background is learnt, which
@@ -304,6 +305,7 @@ class OccupancySettings(SamplerSettings):
         if site.views is not None:
             if self.silhouettes:
                 carve(grid, site.views, site.frame, exact=site.cameras is None)
+                keep_moving(grid, site.views, site.frame)
             if site.initialised and self.fill:
                 fill_seconds = _fill(renderer, field, site)
         settings = (

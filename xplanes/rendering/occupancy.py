@@ -19,7 +19,8 @@ class OccupancyGrid(nn.Module):
     A cell is occupied while the opacity of its density over one sample step is above ``threshold``.
     All cells are initially occupied; an observation lowers the density of its cell by the factor
     ``decay`` at most. Cells that are not ``allowed`` (outside the silhouettes) stay empty; cells
-    that are not ``likely`` can become occupied only next to an occupied cell.
+    that are not ``likely`` can become occupied only next to an occupied cell; cells that are
+    ``kept`` stay occupied, so that what is thin or late can appear in them.
 
     ``least`` is a running minimum of the observed densities: it falls at once and rises slowly. A
     cell that a surface crosses, or that is filled at only some times of its bin, has a high density
@@ -38,6 +39,7 @@ class OccupancyGrid(nn.Module):
     occupied: Tensor
     allowed: Tensor
     likely: Tensor
+    kept: Tensor
 
     def __init__(
         self,
@@ -56,6 +58,7 @@ class OccupancyGrid(nn.Module):
         cells = time_bins * resolution**3
         self.register_buffer("allowed", torch.ones(cells, dtype=torch.bool))
         self.register_buffer("likely", torch.ones(cells, dtype=torch.bool))
+        self.register_buffer("kept", torch.zeros(cells, dtype=torch.bool))
         self.register_buffer("density", torch.full((cells,), 4 * self.empty_density))
         self.register_buffer("least", torch.zeros(cells))
         self.register_buffer("occupied", torch.ones(cells, dtype=torch.bool))
@@ -99,6 +102,10 @@ class OccupancyGrid(nn.Module):
         self.density.mul_(self.likely)
         torch.gt(self.density, self.empty_density, out=self.occupied)
 
+    def keep(self, kept: Tensor) -> None:
+        """Keep cells that are occupied now occupied from now on. Shape and axes as in `allow`."""
+        self.kept.logical_or_(kept.reshape(-1) & self.occupied)
+
     def _occupied_cells(self) -> Tensor:
         """Indices of all occupied cells, ascending. int64 [N]"""
         if self.occupied.device.type == "cpu":
@@ -124,7 +131,8 @@ class OccupancyGrid(nn.Module):
         """
         density = self._usable(density)
         if live is None and cpu_loops(self.density):
-            arrays = cells, density, self.allowed, self.density, self.least, self.occupied
+            fixed = self.allowed, self.kept
+            arrays = cells, density, *fixed, self.density, self.least, self.occupied
             numbers = map(np.float32, (self.decay, TRUST, self.empty_density))
             cpu = compiled("xplanes.rendering.rays_numba")
             cpu.observe_cells(*(array.numpy() for array in arrays), *numbers)
@@ -143,14 +151,14 @@ class OccupancyGrid(nn.Module):
             seen, lowest = torch.where(none, before, seen), torch.where(none, least, lowest)
         self.density.scatter_reduce_(0, cells, seen, "amax", include_self=False)
         self.least.scatter_reduce_(0, cells, lowest, "amin", include_self=False)
-        self.occupied[cells] = self.density[cells] > self.empty_density
+        self.occupied[cells] = (self.density[cells] > self.empty_density) | self.kept[cells]
 
     @torch.no_grad()
     def sweep(self, field: Field, generator: torch.Generator, chunk: int | None = None) -> None:
         """Evaluate every occupied cell once, and empty those without density.
 
-        A cell is kept if it or a spatial neighbour has density at one random point and time, so
-        that a single observation cannot lose a thin surface.
+        A cell stays occupied if it or a spatial neighbour has density at one random point and time,
+        so that a single observation cannot lose a thin surface.
 
         Args:
             field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
@@ -171,11 +179,11 @@ class OccupancyGrid(nn.Module):
         keep = self.occupied & (around.view(-1) > self.empty_density)
         # A cell kept because of a neighbour is emptied if two observations find no density there.
         floor = self.empty_density / max(self.decay, 1e-3) * 1.001
-        kept = seen.clamp_min(floor)
+        raised = seen.clamp_min(floor)
         lost = self.density.clamp_max(0.5 * self.empty_density)
         torch.minimum(self.least, seen, out=self.least)
-        self.density.copy_(torch.where(keep, kept, lost))
-        self.occupied.copy_(keep)
+        self.density.copy_(torch.where(keep, raised, lost))
+        torch.logical_or(keep, self.kept, out=self.occupied)
 
     @torch.no_grad()
     def update(self, field: Field, count: int, generator: torch.Generator) -> None:

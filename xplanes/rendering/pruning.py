@@ -12,8 +12,11 @@ from xplanes.rendering.marching import Rays, Samples, march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.matte import SOLID
-from xplanes.scenes.silhouettes import join_in_time, may_hold
+from xplanes.scenes.silhouettes import join_in_time, may_hold, moving
 from xplanes.scenes.views import Views
+
+STRIDE = 2
+"""Pixels from one row or column that is searched for motion to the next."""
 
 CHUNK = 2**17
 """Points that are projected together, for up to 512 views; fewer for more views."""
@@ -36,10 +39,7 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame, *, exact: bool = True
         return
     size, bins = grid.resolution, grid.time_bins
     covers = _views_of_bins(views.times, bins)
-    axis = (torch.arange(size) + 0.5) * (2 / size) - 1
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).flip(-1)
-    world = frame.to_world(points.reshape(-1, 3))
-    radius = 3**0.5 / size / frame.scale
+    world, radius = _balls(grid, frame)
     allowed = torch.empty(bins, size**3, dtype=torch.bool)
     likely = torch.empty_like(allowed)
     chunk = min(CHUNK, max(1, 512 * CHUNK // len(views)))
@@ -53,6 +53,34 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame, *, exact: bool = True
     if exact:
         grid.allow(allowed)
     grid.presume(likely)
+
+
+def keep_moving(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
+    """Keep the cells occupied in which all fixed cameras show that something moves.
+
+    Thin things that move are learnt late, and their cells seem empty until then.
+
+    Args:
+        grid: Changed in place.
+        views: Training views; if they are not opaque images of fixed cameras in memory, nothing is
+            kept.
+        frame: The field's frame.
+    """
+    if views.is_stored or not views.is_opaque:
+        return
+    world, radius = _balls(grid, frame)
+    bins = grid.bins(views.times)
+    found = moving(views, world, radius=radius, bins=bins, stride=STRIDE)
+    if found is not None:
+        grid.keep(F.pad(found, (0, 0, 0, grid.time_bins - len(found))))
+
+
+def _balls(grid: OccupancyGrid, frame: Frame) -> tuple[Tensor, float]:
+    """Centres of the cells in the world, [G^3, 3], and the radius of the balls around them."""
+    size = grid.resolution
+    axis = (torch.arange(size) + 0.5) * (2 / size) - 1
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).flip(-1)
+    return frame.to_world(points.reshape(-1, 3)), 3**0.5 / size / frame.scale
 
 
 def _views_of_bins(times: Tensor, bins: int) -> list[Tensor]:

@@ -77,7 +77,7 @@ def fill_samples(field_rays, grid_rays, step, chosen, places):
 
 
 @njit(exact=True)
-def observe_cells(cells, observed, allowed, density, least, occupied, decay, trust, empty):
+def observe_cells(cells, observed, allowed, kept, density, least, occupied, decay, trust, empty):
     """Update cells from densities: from the maximum per cell, and ``least`` from the minimum."""
     highest, lowest = np.empty_like(observed), np.empty_like(observed)
     for n in range(len(cells)):
@@ -92,7 +92,7 @@ def observe_cells(cells, observed, allowed, density, least, occupied, decay, tru
         density[cell] = max(density[cell], highest[n])
         least[cell] = min(least[cell], lowest[n])
     for n in range(len(cells)):
-        occupied[cells[n]] = density[cells[n]] > empty
+        occupied[cells[n]] = density[cells[n]] > empty or kept[cells[n]]
 
 
 @njit(parallel=True)

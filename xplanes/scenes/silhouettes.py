@@ -19,6 +19,9 @@ SAME_COLOUR = 4
 LEAST_FRAMES = 3
 """Least number of a camera's images for which their median shows the static content."""
 
+LEAST_CAMERAS = 2
+"""Least number of cameras that tell where in space something moves."""
+
 CHANGE = 20
 """Least difference from the median, out of 255 in any channel, of a changed pixel."""
 
@@ -102,28 +105,43 @@ def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:
         Whether the point may be occupied. bool [V, N]
     """
     inside = torch.ones(len(views), len(points), dtype=torch.bool)
-    intrinsics = views.intrinsics
-    for index, pose in enumerate(views.camera_to_world):
-        height, width = views.size(index)
-        focal, lens = intrinsics.focal[index], intrinsics.lens(index)
-        centre = intrinsics.centre[index]
-        column, row, seen = project(pose, points, focal=focal, centre=centre, lenses=lens)
-        column, row = column.floor(), row.floor()
-        seen = seen & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        stretch = 1.0 if intrinsics.sights is None else intrinsics.sights[index].stretch
-        margin = ball_extent(pose, points, radius, focal=focal, lenses=lens, stretch=stretch)
-        seen &= margin < math.inf
-        if not seen.any():
-            continue
-        # Silhouette pixels in the square around each point, from a summed-area table.
-        sums = F.pad(views.silhouette(index).cumsum(0, dtype=torch.int32).cumsum(1), (1, 0, 1, 0))
-        reach = margin[seen].ceil().clamp(max=max(height, width)).long()
-        row, column = row[seen].long(), column[seen].long()
-        top, left = (row - reach).clamp(min=0), (column - reach).clamp(min=0)
-        end, right = (row + reach + 1).clamp(max=height), (column + reach + 1).clamp(max=width)
-        held = sums[end, right] - sums[top, right] - sums[end, left] + sums[top, left]
-        inside[index, seen] = held > 0
+    for index in range(len(views)):
+        seen, box = _footprints(views, index, points, radius)
+        if seen.any():
+            inside[index, seen] = _meets(views.silhouette(index), box)
     return inside
+
+
+def _footprints(
+    views: Views, index: int, points: Tensor, radius: float
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Points inside an image, and the squares of pixels around them that `_meets` takes.
+
+    Returns:
+        Whether each point is inside, bool [N]; first row and column, and end row and column. [K]
+    """
+    intrinsics, pose = views.intrinsics, views.camera_to_world[index]
+    height, width = views.size(index)
+    focal, lens = intrinsics.focal[index], intrinsics.lens(index)
+    centre = intrinsics.centre[index]
+    column, row, seen = project(pose, points, focal=focal, centre=centre, lenses=lens)
+    column, row = column.floor(), row.floor()
+    seen = seen & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    stretch = 1.0 if intrinsics.sights is None else intrinsics.sights[index].stretch
+    margin = ball_extent(pose, points, radius, focal=focal, lenses=lens, stretch=stretch)
+    seen &= margin < math.inf
+    reach = margin[seen].ceil().clamp(max=max(height, width)).long()
+    row, column = row[seen].long(), column[seen].long()
+    top, left = (row - reach).clamp(min=0), (column - reach).clamp(min=0)
+    end, right = (row + reach + 1).clamp(max=height), (column + reach + 1).clamp(max=width)
+    return seen, (top, left, end, right)
+
+
+def _meets(mask: Tensor, box: tuple[Tensor, ...]) -> Tensor:
+    """Whether each square of pixels meets the mask, from a summed-area table. bool [K]"""
+    sums = F.pad(mask.cumsum(0, dtype=torch.int32).cumsum(1), (1, 0, 1, 0))
+    top, left, end, right = box
+    return sums[end, right] - sums[top, right] - sums[end, left] + sums[top, left] > 0
 
 
 def join_in_time(inside: Tensor, times: Tensor) -> Tensor:
@@ -165,17 +183,61 @@ def changing(views: Views, margins: Sequence[int]) -> Tensor | None:
 
     Source: the idea of DyNeRF's importance sampling (Li et al., CVPR 2022, Section 4.3).
     """
-    cameras = _cameras(views)
-    if any(len(frames) < LEAST_FRAMES for frames in cameras):
+    if (cameras := _fixed_cameras(views)) is None:
         return None
     found = torch.zeros(views.images.shape[:3], dtype=torch.bool)
     for frames in cameras:
-        images = torch.stack([views.image(index)[..., :3] for index in frames])
-        median = images.median(dim=0).values.short()
-        for index, image in zip(frames, images, strict=True):
-            changed = (image.short() - median).abs().amax(dim=-1) >= CHANGE
-            found[index, : len(image), : image.shape[1]] = widened(changed, margins[index])
+        for index, changed in zip(frames, _changed(views, frames), strict=True):
+            shape = tuple(map(slice, changed.shape))
+            found[index][shape] = widened(changed, margins[index])
     return found if found.any() else None
+
+
+def moving(
+    views: Views, points: Tensor, *, radius: float, bins: Tensor, stride: int = 1
+) -> Tensor | None:
+    """Points around which all fixed cameras that see them, two at least, show a change.
+
+    Args:
+        views: Opaque images in memory.
+        points: World points. [N, 3]
+        radius: As for `may_hold`.
+        bins: Time bin of each view; a bin's changes are those of all its images. int64 [V]
+        stride: Only every ``stride``-th row and column of the images is compared.
+
+    Returns:
+        For each bin, which points may be part of what moves, bool [bins, N]; None in the same cases
+        as `changing`.
+    """
+    if (cameras := _fixed_cameras(views)) is None:
+        return None
+    count = int(bins.max()) + 1
+    seen_by, held_by = torch.zeros(2, count, len(points), dtype=torch.int16)
+    for frames in cameras:
+        seen, box = _footprints(views, frames[0], points, radius)
+        box = tuple(torch.div(edge, stride, rounding_mode="floor") for edge in box[:2]) + tuple(
+            -torch.div(-edge, stride, rounding_mode="floor") for edge in box[2:]
+        )
+        changed = _changed(views, frames, stride)
+        those = bins[torch.tensor(frames)]
+        for place in those.unique().tolist():
+            seen_by[place, seen] += 1
+            held_by[place, seen] += _meets(changed[those == place].any(dim=0), box)
+    found = (seen_by >= LEAST_CAMERAS) & (held_by == seen_by)
+    return found if found.any() else None
+
+
+def _changed(views: Views, frames: list[int], stride: int = 1) -> Tensor:
+    """Pixels of a fixed camera's images that differ from their median. bool [F, h, w]"""
+    images = torch.stack([views.image(index)[::stride, ::stride, :3] for index in frames])
+    median = images.median(dim=0).values.short()
+    return torch.stack([(image.short() - median).abs().amax(-1) >= CHANGE for image in images])
+
+
+def _fixed_cameras(views: Views) -> list[list[int]] | None:
+    """The images of each camera; None if a camera has too few, as one that moves."""
+    cameras = _cameras(views)
+    return None if any(len(frames) < LEAST_FRAMES for frames in cameras) else cameras
 
 
 def _cameras(views: Views) -> list[list[int]]:

@@ -367,8 +367,11 @@ def test_masks_become_alpha(scene):
         assert torch.equal(views.image(0), whole)
     # A mask is averaged with its image.
     expected = expected.reshape(4, 3, 4, 3, 4).mean(axis=(1, 3))
-    found = scene.train(resolution=4, mask_use="alpha").image(1).numpy()
-    assert np.abs(found - expected).max() <= 0.5 + 1e-3
+    for key in ("mask_path", "fg_mask_path"):
+        scene.change(1, mask_path=...)
+        scene.change(1, **{key: "mask.png"})
+        found = scene.train(resolution=4, mask_use="alpha").image(1).numpy()
+        assert np.abs(found - expected).max() <= 0.5 + 1e-3
 
 
 def test_masks_mean_the_same_whichever_parts_are_read(scene):

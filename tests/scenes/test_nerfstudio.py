@@ -165,6 +165,7 @@ def test_lists_of_file_names_are_the_splits(capture):
         # Nanoseconds since 1970, which single precision cannot tell apart.
         ("time", 17 * 10**17, 33_000_000, "1700000000000000000 to 1700000000297000000"),
         ("timestamp", 1_700_000_000.25, 0.125, "1700000000.25 to 1700000001.375"),
+        ("timestep_index", 12, 1, "12 to 21"),
     ],
 )
 def test_times_in_any_unit_are_mapped_over_all_frames(capture, caplog, key, first, step, source):

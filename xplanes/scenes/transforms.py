@@ -59,7 +59,7 @@ OTHER_LENSES = ("equirectangular", "latlong", "orthographic")
 FTHETA = "ftheta_p"
 """Beginning of the keys of instant-ngp's f-theta lens, whose first coefficient is usually 0."""
 
-TIMES = ("time", "timestamp")
+TIMES = ("time", "timestamp", "timestep_index")
 """Keys of times; the first one that a frame has is used."""
 
 NUMBERS = (
@@ -105,7 +105,8 @@ IGNORED = (
     *("depth_file_path", "depth_path", "integer_depth_scale", "enable_depth_loading"),
     *("normal_file_path", "depth_unit_scale_factor", "rotation", "render_aabb", "path"),
     *("crop_width", "crop_height", "blur_score", "n_images", "fps", "num_frames"),
-    *("camera", "camera_label", "camera_name", "cam_name"),
+    *("camera", "camera_label", "camera_name", "cam_name", "camera_index", "camera_indices"),
+    *("timestep_id", "timestep_indices", "timestep_index_original", "flame_param_path"),
 )
 """Keys of other programs without effect here."""
 
@@ -426,6 +427,8 @@ def _standard(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
     for key in {*ALIASES} & {*keys}:
         if is_positive(number_in(str(keys[key]))):
             found.setdefault(ALIASES[key], found.pop(key))
+    if "fg_mask_path" in found:
+        found.setdefault("mask_path", found.pop("fg_mask_path"))
     for key in {*NUMBERS} & {*found}:
         if isinstance(found[key], str) and (number := number_in(found[key])) is not None:
             found[key] = number

@@ -211,7 +211,7 @@ def test_every_class_of_models_builds_and_renders(overrides):
     rays = batches.draw(0)
     colour = module.sampler.render(module.field, rays, module.state).colour
     assert colour.shape == rays["target"].shape
-    assert len(colour) == (module.ray_settings.most or 16 * 16)
+    assert len(colour) == (module.ray_settings.most_rays or 16 * 16)
     assert colour.isfinite().all()
 
 

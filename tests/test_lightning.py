@@ -389,7 +389,7 @@ def test_processes_do_not_send_each_other_the_grid_before_each_step(config, tmp_
         finally:
             torch.distributed.destroy_process_group()
     assert len(sent) == 2
-    grid = {buffer.data_ptr() for buffer in module.sampler.parts["grid"].buffers()}
+    grid = {buffer.data_ptr() for buffer in module.sampler.modules["grid"].buffers()}
     assert len(grid) > 3
     assert not grid & sent[-1]
 

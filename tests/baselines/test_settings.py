@@ -153,7 +153,7 @@ def test_tineuvox_rates_and_cells_follow_the_published_schedule(scenes):
     steps = (0, 1999, 2000, 4000, 6000, 19999)
     assert [model.voxels(s) for s in steps] == [125000, 125000, 250000, 500000, 1000000, 1000000]
     for step, since in zip(steps, (0, 1999, 0, 0, 0, 13999), strict=True):
-        assert model.rate(step, 0.5) == pytest.approx(0.1 ** (since / 20000))
+        assert model.rate_factor(step, 0.5) == pytest.approx(0.1 ** (since / 20000))
     rates = {group["name"]: group["lr"] for group in model.groups()}
     assert (rates["grid"], rates["deformation"], rates["trunk"]) == (0.08, 0.0006, 0.0008)
 

@@ -162,8 +162,8 @@ def test_rates_rise_and_fall_as_published(tmp_path):
                 case = warmup, final, step, progress
                 assert found == pytest.approx(expected, abs=1e-12), case
     kplanes, _ = module_of(tmp_path, "model=kplanes", *KPLANES, *PROPOSAL, "model.warmup_steps=512")
-    assert kplanes.model.rate(255, 0.5) == pytest.approx(0.25)
-    assert kplanes.model.rate(10**4, 1.0) == pytest.approx(0)
+    assert kplanes.model.rate_factor(255, 0.5) == pytest.approx(0.25)
+    assert kplanes.model.rate_factor(10**4, 1.0) == pytest.approx(0)
 
 
 def test_tineuvox_adds_up_colours_decided_rays_and_single_samples(tmp_path):

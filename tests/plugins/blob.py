@@ -68,5 +68,5 @@ class BlobModel(Model):
         rate = self.settings.learning_rate
         return [{"params": list(self._field.parameters()), "lr": rate, "name": "blob"}]
 
-    def rate(self, step: int, progress: float) -> float:
+    def rate_factor(self, step: int, progress: float) -> float:
         return 1 - progress

@@ -81,7 +81,7 @@ def test_gains_learn_nothing_from_rays_that_were_left_out():
 )
 def test_exposures_are_matched_where_images_show_surroundings(kind, overrides, matched):
     module = built(kind, *overrides)
-    assert ("exposures" in module.sampler.parts) == matched
+    assert ("exposures" in module.sampler.modules) == matched
     assert ("exposures.logarithms" in module.state_dict()) == matched
 
 
@@ -97,8 +97,8 @@ def test_photos_of_different_exposure_are_told_apart(monkeypatch, tmp_path):
     module = RadianceModule(small_config(tmp_path, "model.rays.per_batch=512"))
     module.build(photos)
     train_quietly(module, photos, tmp_path, 150).save_checkpoint(tmp_path / "last.ckpt")
-    gains = module.sampler.parts["exposures"](torch.arange(12)).detach()
+    gains = module.sampler.modules["exposures"](torch.arange(12)).detach()
     assert gains[dark].mean(dim=1).max() < gains[~dark].mean(dim=1).min()
     torch.testing.assert_close(gains.log().mean(dim=0), torch.zeros(3))
     loaded = RadianceModule.load_from_checkpoint(tmp_path / "last.ckpt")
-    assert torch.equal(loaded.sampler.parts["exposures"](torch.arange(12)), gains)
+    assert torch.equal(loaded.sampler.modules["exposures"](torch.arange(12)), gains)

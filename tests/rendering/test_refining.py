@@ -293,7 +293,7 @@ def test_a_frame_held_out_of_a_corrected_camera_is_rendered_from_the_corrected_p
     views, background = scene.splits["train"], scene.background
     item = whole_view(views, 0, background)
     given = module.predict_step(item, 0)
-    module.sampler.parts["cameras"].motion[:, 3] = 0.2
+    module.sampler.modules["cameras"].motion[:, 3] = 0.2
     poses = module.corrected(views.camera_to_world)
     moved = replace(views, camera_to_world=poses)
     parts = module.field, module.renderer, module.frame

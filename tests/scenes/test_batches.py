@@ -197,7 +197,7 @@ def test_a_static_scene_has_no_other_times():
 def test_batches_of_open_size_follow_the_device():
     cpu, gpu = torch.device("cpu"), torch.device("cuda")
     left_open = replace(RAYS, per_batch="auto", samples_per_batch="auto")
-    assert (left_open.most, left_open.most_samples) == (1365, 8192)
+    assert (left_open.most_rays, left_open.most_samples) == (1365, 8192)
     assert left_open.on(cpu) is left_open
     assert len(batches_of(per_batch="auto").draw(0)["times"]) == 1365
     large = left_open.on(gpu)

@@ -122,14 +122,16 @@ def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():
 def test_time_planes_wait_as_long_as_light_that_passes_the_cube_costs():
     world, white = built("world"), built("white")
     for module, step, waits in ((world, 150, True), (world, 200, False), (white, 150, False)):
-        rates = [module.model.rate_of(name, step, 0.1) for name in ("space", "time")]
+        rates = [module.model.group_rate_factor(name, step, 0.1) for name in ("space", "time")]
         assert rates[0] > 0
         assert rates[1] == (0 if waits else rates[0])
     priceless = built("world", "model.loss.passing=0").model
     site = replace(world.site, initialised=True)  # An LRM has given the field its shape.
     shaped = world.model.settings.build(site)
     for model in (priceless, shaped):
-        assert model.rate_of("time", 150, 0.1) == model.rate_of("space", 150, 0.1)
+        assert model.group_rate_factor("time", 150, 0.1) == model.group_rate_factor(
+            "space", 150, 0.1
+        )
 
 
 def test_large_views_are_few():

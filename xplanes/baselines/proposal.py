@@ -350,7 +350,7 @@ class ProposalSampler(Sampler):
         return self._renderer
 
     @property
-    def parts(self) -> dict[str, nn.Module]:
+    def modules(self) -> dict[str, nn.Module]:
         return {"proposals": self._renderer.proposals}
 
     @property

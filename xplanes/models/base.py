@@ -70,7 +70,7 @@ class Model(ABC):
         return torch.optim.Adam(groups, betas=self.betas, eps=1e-15, fused=True)
 
     @abstractmethod
-    def rate(self, step: int, progress: float) -> float:
+    def rate_factor(self, step: int, progress: float) -> float:
         """Common factor on the learning rates.
 
         Args:
@@ -78,15 +78,15 @@ class Model(ABC):
             progress: Share of the training budget that has been used, from 0 to 1.
         """
 
-    def rate_of(self, group: str, step: int, progress: float) -> float:
-        """Factor on the learning rate of one parameter group; `rate` by default.
+    def group_rate_factor(self, group: str, step: int, progress: float) -> float:
+        """Factor on the learning rate of one parameter group; `rate_factor` by default.
 
         Args:
             group: Name of the group.
-            step: As for `rate`.
-            progress: As for `rate`.
+            step: As for `rate_factor`.
+            progress: As for `rate_factor`.
         """
-        return self.rate(step, progress)
+        return self.rate_factor(step, progress)
 
     def losses(self, rendering: Any, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         """Weighted loss terms that need the rays, by name; training minimises their sum. [] each

@@ -339,14 +339,14 @@ class XPlanesModel(Model):
             terms["floaters"] = self.weights.floaters * background_opacity(rendering, rays)
         return terms
 
-    def rate(self, step: int, progress: float) -> float:
+    def rate_factor(self, step: int, progress: float) -> float:
         return warm_cosine(step, progress, warmup=self.warmup, final=self.settings.final_lr)
 
-    def rate_of(self, group: str, step: int, progress: float) -> float:
+    def group_rate_factor(self, group: str, step: int, progress: float) -> float:
         if group == "time" and self._passing_weight(step):
             return 0.0
         if group != "fine":
-            return self.rate(step, progress)
+            return self.rate_factor(step, progress)
         since = max(0, step - self.fine_start)
         return warm_cosine(since, progress, warmup=self.fine_warmup, final=self.settings.final_lr)
 

@@ -38,8 +38,8 @@ class ExposureSampler(WrappingSampler):
         self.exposures, self.start = Exposures(groups), start
 
     @property
-    def parts(self) -> dict[str, nn.Module]:
-        return self.inner.parts | {"exposures": self.exposures}
+    def modules(self) -> dict[str, nn.Module]:
+        return self.inner.modules | {"exposures": self.exposures}
 
     @property
     def outline(self) -> str:

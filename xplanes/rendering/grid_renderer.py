@@ -385,7 +385,7 @@ class OccupancySampler(Sampler):
         return renderer
 
     @property
-    def parts(self) -> dict[str, nn.Module]:
+    def modules(self) -> dict[str, nn.Module]:
         return {"grid": self.grid}
 
     @property

@@ -64,8 +64,8 @@ class RefiningSampler(WrappingSampler):
         self._seen: Batch | None = None
 
     @property
-    def parts(self) -> dict[str, nn.Module]:
-        return self.inner.parts | {"cameras": self.cameras}
+    def modules(self) -> dict[str, nn.Module]:
+        return self.inner.modules | {"cameras": self.cameras}
 
     @property
     def outline(self) -> str:

@@ -121,7 +121,7 @@ class Sampler(ABC):
         """Renderer for whole images."""
 
     @property
-    def parts(self) -> dict[str, nn.Module]:
+    def modules(self) -> dict[str, nn.Module]:
         """Modules to store in checkpoints, by name."""
         return {}
 
@@ -211,8 +211,8 @@ class WrappingSampler(Sampler):
         return self.inner.renderer
 
     @property
-    def parts(self) -> dict[str, nn.Module]:
-        return self.inner.parts
+    def modules(self) -> dict[str, nn.Module]:
+        return self.inner.modules
 
     @property
     def outline(self) -> str:

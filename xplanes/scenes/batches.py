@@ -105,7 +105,7 @@ class BatchSettings(Settings, ABC):
         return False
 
     @property
-    def most(self) -> int:
+    def most_rays(self) -> int:
         """Maximum rays per batch; 0 if a batch is a whole view."""
         return 0
 
@@ -163,7 +163,7 @@ class RaySettings(BatchSettings):
         return self.match_exposure
 
     @property
-    def most(self) -> int:
+    def most_rays(self) -> int:
         return CPU_RAYS if self.per_batch == "auto" else self.per_batch
 
     @property
@@ -176,7 +176,7 @@ class RaySettings(BatchSettings):
     def fitting(self, rays: int, samples: int) -> int:
         """Number of rays that keeps the number of samples near its maximum."""
         room = self.most_samples * rays / max(1, samples)
-        return min(self.most, max(FEWEST_RAYS, int(room)))
+        return min(self.most_rays, max(FEWEST_RAYS, int(room)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,7 +268,7 @@ class RayBatches(Batches):
         self, views: Views, frame: Frame, settings: RaySettings, *, seed: int, rank: int = 0
     ) -> None:
         self.views, self.frame = views, frame
-        self.rays, self.seed, self.rank = settings.most, seed, rank
+        self.rays, self.seed, self.rank = settings.most_rays, seed, rank
         self.background, self.error_share = settings.background, settings.error_share
         widths = views.intrinsics.size[:, 1].tolist()
         margins = [max(1, round(NEAR_SILHOUETTE * width)) for width in widths]

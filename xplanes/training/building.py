@@ -151,7 +151,7 @@ def build_parts(
         exposed=cameras if rays.matches_exposure and scene.is_surrounded else None,
         device=device,
         samples_per_batch=resolved.most_samples,
-        batch_scale=resolved.most / rays.most if rays.most else 1.0,
+        batch_scale=resolved.most_rays / rays.most_rays if rays.most_rays else 1.0,
     )
     parts = Parts.assemble(found.model, site, found)
     assert parts.initialisation is not None
@@ -361,7 +361,7 @@ def require_groups(model: Model, sampler: Sampler) -> None:
                 f"has; it takes {', '.join(optimizer.defaults)}"
             )
     trained = {id(parameter) for group in groups for parameter in group["params"]}
-    for part in (model.field, *sampler.parts.values()):
+    for part in (model.field, *sampler.modules.values()):
         for name, parameter in part.named_parameters():
             if parameter.requires_grad and id(parameter) not in trained:
                 raise ConfigError(

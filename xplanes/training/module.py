@@ -199,9 +199,9 @@ class RadianceModule(LightningModule):
         self._parts = parts
         self.field: Representation = parts.field
         self.error_map = ErrorMap(parts.site.steps(START))
-        for name, part in parts.sampler.parts.items():
+        for name, part in parts.sampler.modules.items():
             self.add_module(name, part)
-        self.rays = parts.sampler.first_rays(self.ray_settings.most)
+        self.rays = parts.sampler.first_rays(self.ray_settings.most_rays)
 
     @property
     def parts(self) -> Parts:
@@ -265,8 +265,8 @@ class RadianceModule(LightningModule):
 
         The occupancy grid has 20 MB; the processes synchronise it at intervals.
         """
-        parts = self.sampler.parts.items()
-        return [f"{name}.{key}" for name, part in parts for key, _ in part.named_buffers()]
+        modules = self.sampler.modules.items()
+        return [f"{name}.{key}" for name, part in modules for key, _ in part.named_buffers()]
 
     # Training
 
@@ -306,7 +306,7 @@ class RadianceModule(LightningModule):
 
     def on_train_start(self) -> None:
         if self.global_rank:  # What a checkpoint holds counts once, in the first process.
-            for part in self.sampler.parts.values():
+            for part in self.sampler.modules.values():
                 for name in getattr(part, "own", ()):
                     getattr(part, name).zero_()
             self.error_map.drop_own()
@@ -322,7 +322,7 @@ class RadianceModule(LightningModule):
             return
         model, state, optimizer = self.model, self.state, self._optimizer
         for group, peak in zip(optimizer.param_groups, self._peaks, strict=True):
-            group["lr"] = model.rate_of(group["name"], state.step, state.progress) * peak
+            group["lr"] = model.group_rate_factor(group["name"], state.step, state.progress) * peak
         model.before_step(state, optimizer)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -497,7 +497,7 @@ class RadianceModule(LightningModule):
         """
         if self._trainer is None or self._trainer.world_size == 1:
             return
-        for part in self.sampler.parts.values():
+        for part in self.sampler.modules.values():
             own = getattr(part, "own", ())
             for name, buffer in part.named_buffers():
                 if name not in own:

@@ -79,8 +79,8 @@ class DeformedGaussiansModel(GaussiansModel):
             groups.append({"params": network, "lr": self.settings.network_lr, "name": "network"})
         return groups
 
-    def rate_of(self, group: str, step: int, progress: float) -> float:
+    def group_rate_factor(self, group: str, step: int, progress: float) -> float:
         """Exponential decay of the learning rates of means and network."""
         if group == "network":
             return self.settings.final_network_lr**progress
-        return super().rate_of(group, step, min(1.0, progress / MEANS_UNTIL))
+        return super().group_rate_factor(group, step, min(1.0, progress / MEANS_UNTIL))

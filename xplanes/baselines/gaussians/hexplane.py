@@ -99,7 +99,7 @@ class HexPlaneGaussiansModel(GaussiansModel):
             groups.append({"params": network, "lr": settings.network_lr, "name": "network"})
         return groups
 
-    def rate_of(self, group: str, step: int, progress: float) -> float:
+    def group_rate_factor(self, group: str, step: int, progress: float) -> float:
         """Exponential decay for means, planes and network, restarted in the dynamic stage."""
         if group not in ("means", "planes", "network"):
             return 1.0

@@ -124,10 +124,10 @@ class GaussiansModel(Model):
             for name, rate in rates.items()
         ]
 
-    def rate(self, step: int, progress: float) -> float:
+    def rate_factor(self, step: int, progress: float) -> float:
         return 1.0
 
-    def rate_of(self, group: str, step: int, progress: float) -> float:
+    def group_rate_factor(self, group: str, step: int, progress: float) -> float:
         """Exponential decay of the means' learning rate."""
         return self._settings.final_lr**progress if group == "means" else 1.0
 

@@ -118,7 +118,7 @@ class KPlanesModel(Model):
             for name, part in self._field.named_children()
         ]
 
-    def rate(self, step: int, progress: float) -> float:
+    def rate_factor(self, step: int, progress: float) -> float:
         return warm_cosine(step, progress, warmup=self.settings.warmup_steps, final=0.0)
 
     def regularise(self, state: TrainingState) -> None:

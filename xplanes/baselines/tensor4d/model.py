@@ -146,7 +146,7 @@ class Tensor4DDensityModel(Model):
     def optimizer(self, groups: list[Group]) -> torch.optim.Optimizer:
         return torch.optim.Adam(groups, fused=True)
 
-    def rate(self, step: int, progress: float) -> float:
+    def rate_factor(self, step: int, progress: float) -> float:
         settings = self.settings
         warmup, final = settings.warmup_steps, settings.final_rate
         return warm_cosine(step, progress, warmup=warmup, final=final)

@@ -154,7 +154,7 @@ class TiNeuVoxModel(Model):
     def optimizer(self, groups: list[Group]) -> torch.optim.Optimizer:
         return MaskedAdam(groups)
 
-    def rate(self, step: int, progress: float) -> float:
+    def rate_factor(self, step: int, progress: float) -> float:
         begun = max([at for at in self.settings.grow_at if at <= step], default=0)
         return 0.1 ** ((step - begun) / self.settings.decay_steps)
 

@@ -235,7 +235,8 @@ class OccupancySettings(SamplerSettings):
     skip_occluded: bool  # Skip samples behind opaque surfaces.
     occlusion: Annotated[float, Range(0, 1)]  # Transmittance below which samples are occluded.
     thinning: Weight  # Subsample gradients below this times the mean, on the CPU; 0: off.
-    # Prune cells outside the silhouettes (alpha); keep those in which all fixed cameras see motion.
+    # Prune cells outside the silhouettes (alpha). In opaque images, keep the cells in which every
+    # fixed camera that sees them shows a change.
     silhouettes: bool
     fill: bool  # Prune empty cells of an initialised field.
     # Weight of the mean opacity per step of random points in occupied cells. It empties space that

@@ -20,7 +20,7 @@ class OccupancyGrid(nn.Module):
     All cells are initially occupied; an observation lowers the density of its cell by the factor
     ``decay`` at most. Cells that are not ``allowed`` (outside the silhouettes) stay empty; cells
     that are not ``likely`` can become occupied only next to an occupied cell; cells that are
-    ``kept`` stay occupied, so that what is thin or late can appear in them.
+    ``kept`` stay occupied, so that thin parts, which are learnt late, can still appear in them.
 
     ``least`` is a running minimum of the observed densities: it falls at once and rises slowly. A
     cell that a surface crosses, or that is filled at only some times of its bin, has a high density
@@ -62,6 +62,7 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("density", torch.full((cells,), 4 * self.empty_density))
         self.register_buffer("least", torch.zeros(cells))
         self.register_buffer("occupied", torch.ones(cells, dtype=torch.bool))
+        self.register_load_state_dict_pre_hook(_without_kept)
 
     def bins(self, times: Tensor) -> Tensor:
         """Time bin of each time from 0 to 1. int64 [N]"""
@@ -90,8 +91,9 @@ class OccupancyGrid(nn.Module):
         Cells that were excluded before stay excluded, whatever ``allowed`` contains.
         """
         self.allowed.logical_and_(allowed.reshape(-1))
+        self.kept.logical_and_(self.allowed)
         self.density.mul_(self.allowed)
-        torch.gt(self.density, self.empty_density, out=self.occupied)
+        self._mark()
 
     def presume(self, likely: Tensor) -> None:
         """Empty all other cells; they become occupied only next to occupied ones.
@@ -100,11 +102,17 @@ class OccupancyGrid(nn.Module):
         """
         self.likely.logical_and_(likely.reshape(-1))
         self.density.mul_(self.likely)
-        torch.gt(self.density, self.empty_density, out=self.occupied)
+        self._mark()
 
     def keep(self, kept: Tensor) -> None:
-        """Keep cells that are occupied now occupied from now on. Shape and axes as in `allow`."""
-        self.kept.logical_or_(kept.reshape(-1) & self.occupied)
+        """Mark cells to stay occupied, if they are allowed. Shape and axes as in `allow`."""
+        self.kept.logical_or_(kept.reshape(-1) & self.allowed)
+        self._mark()
+
+    def _mark(self) -> None:
+        """Mark the cells that are occupied, all of them."""
+        torch.gt(self.density, self.empty_density, out=self.occupied)
+        self.occupied.logical_or_(self.kept)
 
     def _occupied_cells(self) -> Tensor:
         """Indices of all occupied cells, ascending. int64 [N]"""
@@ -292,3 +300,8 @@ class OccupancyGrid(nn.Module):
         index = [cells % size, cells // size % size, cells // size**2 % size, cells // size**3]
         place = torch.stack(index, dim=-1) + uniform
         return place[:, :3] * (2 / size) - 1, place[:, 3] / self.time_bins
+
+
+def _without_kept(grid: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """Checkpoints from before cells were kept leave those of the grid as they are."""
+    state.setdefault(f"{prefix}kept", grid.kept)

@@ -15,8 +15,8 @@ from xplanes.scenes.matte import SOLID
 from xplanes.scenes.silhouettes import join_in_time, may_hold, moving
 from xplanes.scenes.views import Views
 
-STRIDE = 2
-"""Pixels from one row or column that is searched for motion to the next."""
+MOST_KEPT = 0.15
+"""Largest share of the cells that are kept because something moves there."""
 
 CHUNK = 2**17
 """Points that are projected together, for up to 512 views; fewer for more views."""
@@ -56,23 +56,23 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame, *, exact: bool = True
 
 
 def keep_moving(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
-    """Keep the cells occupied in which all fixed cameras show that something moves.
+    """Keep cells occupied in which every fixed camera that sees them shows a change.
 
-    Thin things that move are learnt late, and their cells seem empty until then.
+    Thin parts that move are learnt late, and their cells seem empty until then.
 
     Args:
-        grid: Changed in place.
-        views: Training views; if they are not opaque images of fixed cameras in memory, nothing is
-            kept.
+        grid: Changed in place. It is unchanged if more cells than `MOST_KEPT` would be kept: then
+            the light changes, or the images are noisy.
+        views: Training views; images with silhouettes or in files, and static scenes, keep none.
         frame: The field's frame.
     """
-    if views.is_stored or not views.is_opaque:
+    if views.is_stored or views.is_static or not views.is_opaque:
         return
-    world, radius = _balls(grid, frame)
     bins = grid.bins(views.times)
-    found = moving(views, world, radius=radius, bins=bins, stride=STRIDE)
-    if found is not None:
-        grid.keep(F.pad(found, (0, 0, 0, grid.time_bins - len(found))))
+    world, radius = _balls(grid, frame)
+    found = moving(views, world, radius=radius, bins=bins, count=grid.time_bins)
+    if found is not None and found.float().mean() <= MOST_KEPT:
+        grid.keep(found)
 
 
 def _balls(grid: OccupancyGrid, frame: Frame) -> tuple[Tensor, float]:

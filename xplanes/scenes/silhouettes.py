@@ -22,6 +22,12 @@ LEAST_FRAMES = 3
 LEAST_CAMERAS = 2
 """Least number of cameras that tell where in space something moves."""
 
+HALF = 2
+"""Side in pixels of the squares that are compared to find where in space something moves."""
+
+POINTS = 2**18
+"""Points that are projected together."""
+
 CHANGE = 20
 """Least difference from the median, out of 255 in any channel, of a changed pixel."""
 
@@ -137,7 +143,7 @@ def _footprints(
     return seen, (top, left, end, right)
 
 
-def _meets(mask: Tensor, box: tuple[Tensor, ...]) -> Tensor:
+def _meets(mask: Tensor, box: Sequence[Tensor]) -> Tensor:
     """Whether each square of pixels meets the mask, from a summed-area table. bool [K]"""
     sums = F.pad(mask.cumsum(0, dtype=torch.int32).cumsum(1), (1, 0, 1, 0))
     top, left, end, right = box
@@ -183,61 +189,90 @@ def changing(views: Views, margins: Sequence[int]) -> Tensor | None:
 
     Source: the idea of DyNeRF's importance sampling (Li et al., CVPR 2022, Section 4.3).
     """
-    if (cameras := _fixed_cameras(views)) is None:
+    cameras = _cameras(views)
+    if any(len(frames) < LEAST_FRAMES for frames in cameras):
         return None
     found = torch.zeros(views.images.shape[:3], dtype=torch.bool)
     for frames in cameras:
-        for index, changed in zip(frames, _changed(views, frames), strict=True):
-            shape = tuple(map(slice, changed.shape))
-            found[index][shape] = widened(changed, margins[index])
+        images = torch.stack([views.image(index)[..., :3].permute(2, 0, 1) for index in frames])
+        for index, changed in zip(frames, _changed(images), strict=True):
+            height, width = changed.shape
+            found[index, :height, :width] = widened(changed, margins[index])
     return found if found.any() else None
 
 
 def moving(
-    views: Views, points: Tensor, *, radius: float, bins: Tensor, stride: int = 1
+    views: Views, points: Tensor, *, radius: float, bins: Tensor, count: int
 ) -> Tensor | None:
-    """Points around which all fixed cameras that see them, two at least, show a change.
+    """Points around which every fixed camera that sees them, two at least, shows a change.
+
+    What a static thing hides from one camera does not count. Cameras that move or have few images
+    are left out. Images are compared at half their size.
 
     Args:
         views: Opaque images in memory.
         points: World points. [N, 3]
         radius: As for `may_hold`.
-        bins: Time bin of each view; a bin's changes are those of all its images. int64 [V]
-        stride: Only every ``stride``-th row and column of the images is compared.
+        bins: Time bin of each view. int64 [V]
+        count: Number of bins. A bin shows the changes of all images in it, or of those in the bins
+            before and after that have any.
 
     Returns:
-        For each bin, which points may be part of what moves, bool [bins, N]; None in the same cases
-        as `changing`.
+        For each bin, which points may be part of what moves, bool [count, N]; None if there are
+        fewer than two fixed cameras.
     """
-    if (cameras := _fixed_cameras(views)) is None:
+    cameras = [frames for frames in _cameras(views) if len(frames) >= LEAST_FRAMES]
+    if len(cameras) < LEAST_CAMERAS:
         return None
-    count = int(bins.max()) + 1
-    seen_by, held_by = torch.zeros(2, count, len(points), dtype=torch.int16)
+    seen_by, changed_by = torch.zeros(2, count, len(points), dtype=torch.int16)
     for frames in cameras:
-        seen, box = _footprints(views, frames[0], points, radius)
-        box = tuple(torch.div(edge, stride, rounding_mode="floor") for edge in box[:2]) + tuple(
-            -torch.div(-edge, stride, rounding_mode="floor") for edge in box[2:]
-        )
-        changed = _changed(views, frames, stride)
-        those = bins[torch.tensor(frames)]
-        for place in those.unique().tolist():
-            seen_by[place, seen] += 1
-            held_by[place, seen] += _meets(changed[those == place].any(dim=0), box)
-    found = (seen_by >= LEAST_CAMERAS) & (held_by == seen_by)
-    return found if found.any() else None
+        shown, changed = _halved_changes(views, frames)
+        there = bins[torch.tensor(frames)]
+        covers = [_images_of_bin(there, place) for place in range(count)]
+        for start in range(0, len(points), POINTS):
+            part = slice(start, start + POINTS)
+            inside, box = _footprints(views, frames[0], points[part], radius)
+            edges = [torch.div(edge, HALF, rounding_mode="floor") for edge in box[:2]]
+            edges += [torch.div(edge + 1, HALF, rounding_mode="floor") for edge in box[2:]]
+            for place, cover in enumerate(covers):
+                seen_by[place, part][inside] += _meets(shown[cover].any(dim=0), edges)
+                changed_by[place, part][inside] += _meets(changed[cover].any(dim=0), edges)
+    return (seen_by >= LEAST_CAMERAS) & (changed_by == seen_by)
 
 
-def _changed(views: Views, frames: list[int], stride: int = 1) -> Tensor:
-    """Pixels of a fixed camera's images that differ from their median. bool [F, h, w]"""
-    images = torch.stack([views.image(index)[::stride, ::stride, :3] for index in frames])
+def _images_of_bin(bins: Tensor, place: int) -> Tensor:
+    """A camera's images in a time bin, or else in those next to it that have any. bool [F]"""
+    if (inside := bins == place).any():
+        return inside
+    before, after = bins[bins < place], bins[bins > place]
+    near = [*before.sort().values[-1:], *after.sort().values[:1]]
+    return torch.isin(bins, torch.stack(near))
+
+
+def _halved_changes(views: Views, frames: list[int]) -> tuple[Tensor, Tensor]:
+    """Squares of four pixels that a camera's images show, and that differ from their median.
+
+    Averages are compared: they are less noisy, and tell of lines of one pixel.
+
+    Returns:
+        bool [F, h / 2, w / 2] each, rounded up
+    """
+    shown, images = [], []
+    for index in frames:
+        image = views.image(index)[..., :3].permute(2, 0, 1).float()[None]
+        images.append(F.avg_pool2d(image, HALF, ceil_mode=True, count_include_pad=False)[0])
+        valid = views.shown(index)
+        valid = torch.ones(image.shape[2:], dtype=torch.bool) if valid is None else valid
+        hidden = F.max_pool2d((~valid).float()[None], HALF, ceil_mode=True)[0]
+        shown.append(hidden == 0)
+    halved, whole = torch.stack(images).to(torch.uint8), torch.stack(shown)
+    return whole, torch.stack(_changed(halved)) & whole
+
+
+def _changed(images: Tensor) -> list[Tensor]:
+    """Pixels of a camera's images that differ from their median. uint8 [F, 3, h, w] -> [h, w]"""
     median = images.median(dim=0).values.short()
-    return torch.stack([(image.short() - median).abs().amax(-1) >= CHANGE for image in images])
-
-
-def _fixed_cameras(views: Views) -> list[list[int]] | None:
-    """The images of each camera; None if a camera has too few, as one that moves."""
-    cameras = _cameras(views)
-    return None if any(len(frames) < LEAST_FRAMES for frames in cameras) else cameras
+    return [(image.short() - median).abs().amax(dim=0) >= CHANGE for image in images]
 
 
 def _cameras(views: Views) -> list[list[int]]:

@@ -302,6 +302,6 @@ class OccupancyGrid(nn.Module):
         return place[:, :3] * (2 / size) - 1, place[:, 3] / self.time_bins
 
 
-def _without_kept(grid: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
+def _without_kept(grid: OccupancyGrid, state: dict[str, Tensor], prefix: str, *_: object) -> None:
     """Checkpoints from before cells were kept leave those of the grid as they are."""
     state.setdefault(f"{prefix}kept", grid.kept)

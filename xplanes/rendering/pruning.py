@@ -15,7 +15,7 @@ from xplanes.scenes.matte import SOLID
 from xplanes.scenes.silhouettes import join_in_time, may_hold, moving
 from xplanes.scenes.views import Views
 
-MOST_KEPT = 0.15
+MOST_KEPT = 0.2
 """Largest share of the cells that are kept because something moves there."""
 
 CHUNK = 2**17

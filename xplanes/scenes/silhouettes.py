@@ -25,6 +25,9 @@ LEAST_CAMERAS = 2
 HALF = 2
 """Side in pixels of the squares that are compared to find where in space something moves."""
 
+MARGIN = 1
+"""Squares around a point that count as near it, since poses are not exact."""
+
 POINTS = 2**18
 """Points that are projected together."""
 
@@ -232,12 +235,19 @@ def moving(
         for start in range(0, len(points), POINTS):
             part = slice(start, start + POINTS)
             inside, box = _footprints(views, frames[0], points[part], radius)
-            edges = [torch.div(edge, HALF, rounding_mode="floor") for edge in box[:2]]
-            edges += [torch.div(edge + 1, HALF, rounding_mode="floor") for edge in box[2:]]
+            edges = _in_halved(box, shown.shape[1:])
             for place, cover in enumerate(covers):
                 seen_by[place, part][inside] += _meets(shown[cover].any(dim=0), edges)
                 changed_by[place, part][inside] += _meets(changed[cover].any(dim=0), edges)
     return (seen_by >= LEAST_CAMERAS) & (changed_by == seen_by)
+
+
+def _in_halved(box: Sequence[Tensor], size: Sequence[int]) -> list[Tensor]:
+    """Squares of pixels in an image of half the size, wider by `MARGIN` on each side."""
+    top, left, end, right = (torch.div(edge, HALF, rounding_mode="floor") for edge in box)
+    (height, width), more = size, MARGIN + 1  # The last square may be cut off.
+    first = ((top - MARGIN).clamp(min=0), (left - MARGIN).clamp(min=0))
+    return [*first, (end + more).clamp(max=height), (right + more).clamp(max=width)]
 
 
 def _images_of_bin(bins: Tensor, place: int) -> Tensor:

@@ -1,7 +1,7 @@
 """Foreground pixels (silhouettes, or changes in images of fixed cameras), and the visual hull."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -94,10 +94,14 @@ def count_in_squares(mask: Tensor, side: int) -> Tensor:
 
 def widened(mask: Tensor, reach: int) -> Tensor:
     """The mask, dilated by ``reach`` pixels with a square. bool [H, W]"""
-    side = 2 * reach + 1
-    # Separable: rows, then columns, is cheaper than the square.
-    rows = F.max_pool2d(mask.float()[None], (side, 1), stride=1, padding=(reach, 0))
-    return F.max_pool2d(rows, (1, side), stride=1, padding=(0, reach))[0] > 0
+    for axis in (0, 1):
+        size, places = mask.shape[axis], torch.arange(mask.shape[axis])
+        # Differences of cumulative sums cost the same whatever the reach.
+        sums = F.pad(mask.cumsum(axis, dtype=torch.int32), (0, 0, 1, 0) if axis == 0 else (1, 0))
+        ends = (places + reach + 1).clamp(max=size), (places - reach).clamp(min=0)
+        last, first = (sums.index_select(axis, at) for at in ends)
+        mask = last > first
+    return mask
 
 
 def may_hold(views: Views, points: Tensor, *, radius: float) -> Tensor:
@@ -146,7 +150,7 @@ def _footprints(
     return seen, (top, left, end, right)
 
 
-def _meets(mask: Tensor, box: Sequence[Tensor]) -> Tensor:
+def _meets(mask: Tensor, box: Iterable[Tensor]) -> Tensor:
     """Whether each square of pixels meets the mask, from a summed-area table. bool [K]"""
     sums = F.pad(mask.cumsum(0, dtype=torch.int32).cumsum(1), (1, 0, 1, 0))
     top, left, end, right = box
@@ -227,19 +231,24 @@ def moving(
     cameras = [frames for frames in _cameras(views) if len(frames) >= LEAST_FRAMES]
     if len(cameras) < LEAST_CAMERAS:
         return None
-    seen_by, changed_by = torch.zeros(2, count, len(points), dtype=torch.int16)
+    found = torch.ones(count, len(points), dtype=torch.bool)
+    seen_by = torch.zeros(count, len(points), dtype=torch.int16)
     for frames in cameras:
         shown, changed = _halved_changes(views, frames)
         there = bins[torch.tensor(frames)]
         covers = [_images_of_bin(there, place) for place in range(count)]
         for start in range(0, len(points), POINTS):
-            part = slice(start, start + POINTS)
-            inside, box = _footprints(views, frames[0], points[part], radius)
-            edges = _in_halved(box, shown.shape[1:])
+            inside, box = _footprints(views, frames[0], points[start : start + POINTS], radius)
+            inside = inside.nonzero()[:, 0] + start
+            squares = torch.stack(_in_halved(box, changed.shape[1:]))
             for place, cover in enumerate(covers):
-                seen_by[place, part][inside] += _meets(shown[cover].any(dim=0), edges)
-                changed_by[place, part][inside] += _meets(changed[cover].any(dim=0), edges)
-    return (seen_by >= LEAST_CAMERAS) & (changed_by == seen_by)
+                left = found[place, inside]
+                if shown is not None:
+                    left[left.clone()] = _meets(shown[cover].any(dim=0), squares[:, left])
+                seen = inside[left]
+                found[place, seen] = _meets(changed[cover].any(dim=0), squares[:, left])
+                seen_by[place, seen] += 1
+    return found & (seen_by >= LEAST_CAMERAS)
 
 
 def _in_halved(box: Sequence[Tensor], size: Sequence[int]) -> list[Tensor]:
@@ -259,24 +268,27 @@ def _images_of_bin(bins: Tensor, place: int) -> Tensor:
     return torch.isin(bins, torch.stack(near))
 
 
-def _halved_changes(views: Views, frames: list[int]) -> tuple[Tensor, Tensor]:
+def _halved_changes(views: Views, frames: list[int]) -> tuple[Tensor | None, Tensor]:
     """Squares of four pixels that a camera's images show, and that differ from their median.
 
     Averages are compared: they are less noisy, and tell of lines of one pixel.
 
     Returns:
-        bool [F, h / 2, w / 2] each, rounded up
+        bool [F, h / 2, w / 2] each, rounded up; the first is None if all pixels are shown.
     """
-    shown, images = [], []
+    images = []
     for index in frames:
-        image = views.image(index)[..., :3].permute(2, 0, 1).float()[None]
-        images.append(F.avg_pool2d(image, HALF, ceil_mode=True, count_include_pad=False)[0])
-        valid = views.shown(index)
-        valid = torch.ones(image.shape[2:], dtype=torch.bool) if valid is None else valid
-        hidden = F.max_pool2d((~valid).float()[None], HALF, ceil_mode=True)[0]
-        shown.append(hidden == 0)
-    halved, whole = torch.stack(images).to(torch.uint8), torch.stack(shown)
-    return whole, torch.stack(_changed(halved)) & whole
+        image = views.image(index)[..., :3].permute(2, 0, 1).contiguous().float()
+        images.append(F.avg_pool2d(image, HALF, ceil_mode=True, count_include_pad=False).byte())
+    changed = torch.stack(_changed(torch.stack(images)))
+    masks = [views.shown(index) for index in frames]
+    if all(mask is None for mask in masks):
+        return None, changed
+    shown = torch.ones_like(changed)
+    for whole, mask in zip(shown, masks, strict=True):
+        if mask is not None:
+            whole.copy_(F.max_pool2d((~mask).float()[None], HALF, ceil_mode=True)[0] == 0)
+    return shown, changed & shown
 
 
 def _changed(images: Tensor) -> list[Tensor]:

@@ -211,6 +211,29 @@ def test_folders_of_cameras_may_have_other_names_and_levels(videos, tmp_path, ou
     require_all(read(tmp_path, test_cameras=[name.format(0)]))
 
 
+@pytest.mark.parametrize("calibration", ["poses", "transforms", "folders", "colmap"])
+@pytest.mark.parametrize("what", ["images", "clip.mp4"])
+def test_sources_of_one_name_in_folders_of_cameras(images, calibration, what):
+    for camera in range(CAMERAS):
+        shutil.rmtree(folder := images / f"cam{camera:02d}")
+        folder.mkdir()
+        (write_images if what == "images" else write_video)(folder / what, rgb(camera))
+        if what == "images":
+            shutil.copytree(folder / what, folder / "masks")
+    first = f"cam{{:02d}}/{what}" + "/5.png" * (what == "images")
+    if calibration != "poses":
+        (images / "poses_bounds.npy").unlink()
+    if calibration == "colmap":
+        with_colmap(images, "cam{:02d}/images/5.png")
+    elif calibration != "poses":
+        with_transforms(images, first if calibration == "transforms" else "cam{:02d}")
+    require_recognised(images)
+    found = read(images)
+    assert {file.split("/")[0] for file in found.splits["test"].files} == {"cam00"}
+    require_rays_of(found.splits["test"], list(range(FRAMES)))
+    assert len(found.splits["train"]) == len(VIEWS) - FRAMES
+
+
 @pytest.mark.parametrize("names", ["Camera Camera.001 Camera.002", "cam cam2", "cam_left cam_top2"])
 def test_some_cameras_have_no_number(tmp_path, names):
     for name in names.split():

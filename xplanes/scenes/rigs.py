@@ -8,7 +8,7 @@ model of COLMAP that has registered one image per camera, with the name of the c
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -94,12 +94,22 @@ def read_cameras(folder: Path) -> tuple[list[Camera], Mapping[str, Any]]:
             f"camera) nor {MODELS[0]} (COLMAP's model of an image of each), but {found}. Add the "
             "calibration of the cameras."
         )
-    names = [camera.name for camera in cameras]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise SceneError(
-            f"{folder}: several cameras are called {twice[0]}. Rename their videos or folders."
-        )
-    return cameras, content
+    cameras = [replace(camera, source=_with_frames(camera.source)) for camera in cameras]
+    return _named_apart(cameras), content
+
+
+def _named_apart(cameras: Sequence[Camera]) -> list[Camera]:
+    """Cameras of equal names are called by the folders in which their sources differ."""
+    if len({camera.name for camera in cameras}) == len(cameras):
+        return list(cameras)
+    paths = [camera.source.parts for camera in cameras]
+    deepest = max(map(len, paths))
+    levels = zip(*([*path, *[""] * (deepest - len(path))] for path in paths), strict=True)
+    different = zip(*(level for level in levels if len({*level}) > 1), strict=True)
+    return [
+        replace(camera, name="_".join(filter(None, parts)))
+        for camera, parts in zip(cameras, different, strict=True)
+    ]
 
 
 def recordings_of_cameras(folder: Path) -> list[Path]:
@@ -153,7 +163,7 @@ def is_rig(folder: Path) -> bool:
             source = _source("", folder.resolve(), frame["file_path"])
             if source in sources:
                 return False
-            if source.is_dir():
+            if _with_frames(source).is_dir():
                 kinds = [kind(path.name) for path in images_in(source)]
                 if len({*kinds}) == len(kinds):
                     return False
@@ -271,9 +281,10 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
         model.names, model.camera_to_world, model.calibrations, strict=True
     ):
         image = PurePosixPath(name)
+        outer = [folder.name for folder in image.parents if sources[folder.name]]
         found = [
             path
-            for text in dict.fromkeys((image.stem, image.parent.name))
+            for text in dict.fromkeys((image.stem, *outer[:1]))
             # A video may be beside a folder of images extracted from it.
             for path in [path for path in sources[text] if path.is_file()] or sources[text]
         ]
@@ -331,6 +342,14 @@ def _source(label: str, folder: Path, name: Any) -> Path:
     if source == folder:
         raise SceneError(f"{label}: file_path is the scene's folder, not that of one camera.")
     return source
+
+
+def _with_frames(source: Path) -> Path:
+    """A camera's source, or the only video in its folder if that has no images."""
+    if source.is_file() or images_in(source):
+        return source
+    inside = [path for path in source.iterdir() if path.suffix.lower() in videos.SUFFIXES]
+    return inside[0] if len(inside) == 1 else source
 
 
 def images_in(folder: Path) -> list[Path]:

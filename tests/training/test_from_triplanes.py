@@ -209,6 +209,22 @@ def test_a_field_that_starts_again_keeps_l_r_while_it_is_of_use(built):
     assert again.stronger().model.sparse is None
 
 
+@pytest.mark.parametrize(
+    ("overrides", "weight"),
+    [
+        (["data.views=2", "lrm=none"], 1.2),
+        (["data.views=4", "lrm=none"], 0.6),
+        (["lrm=none"], 0.3),
+        (["data.views=2", "lrm=none", "model.loss.variation_views=null"], 0.3),
+        (["data.views=2"], 0.3),
+    ],
+)
+def test_random_planes_are_smoother_where_few_cameras_look(built, overrides, weight):
+    smooth = ["model.loss.total_variation=0.3", "model.fine=null", "model.loss.variation_views=8"]
+    model = built(*smooth, *overrides).model
+    assert model.total_variation == pytest.approx(weight)
+
+
 def test_total_variation_has_a_weight_for_the_planes_of_space_and_one_for_those_of_time(built):
     """Values and gradients, against the formula in float64."""
     weights = {"total_variation": 0.3, "time_variation": 0.7}

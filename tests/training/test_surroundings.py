@@ -107,6 +107,25 @@ def test_a_world_gets_a_background_and_the_planes_are_initialised_as_ever():
     assert set(terms(with_, "world")) == set(expected.split())
 
 
+@pytest.mark.parametrize(
+    ("kind", "overrides", "weight"),
+    [
+        ("alpha", ["model.fine.texels=8"], 0.2),
+        ("alpha", ["model.fine=null"], 0.1),
+        ("world", ["model.fine.texels=8"], 0.3),
+        ("world", ["model.plane_set=three", "model.fine.texels=8"], 0.2),
+        ("world", ["model.plane_set=three", "model.fine=null"], 0.1),
+    ],
+)
+def test_total_variation_of_space_planes_depends_on_what_they_show(kind, overrides, weight):
+    weights = "fine.coarse_variation=0.2", "loss.total_variation_with_background=0.3"
+    smooth = ["model.loss.total_variation=0.1", *(f"model.{key}" for key in weights)]
+    smooth += ["model.loss.variation_views=null"]
+    if "model.fine=null" in overrides:
+        smooth.remove("model.fine.coarse_variation=0.2")
+    assert built(kind, *smooth, *overrides).model.total_variation == weight
+
+
 def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():
     module = built("world", "model.loss.passing=0.5", "model.loss.passing_steps=200")
     batch, rendering = rendered(module, "world")

@@ -78,7 +78,9 @@ class FineSettings(Settings):
     channels: Count  # Channels of each plane, at most `model.channels`.
     start: Steps  # Step from which they are trained.
     total_variation: Weight  # Weight of their total variation.
-    coarse_variation: Weight  # Replaces `model.loss.total_variation` where there are fine planes.
+    # Replaces `model.loss.total_variation` where there are fine planes, but not in moving scenes
+    # with surroundings.
+    coarse_variation: Weight
     lr: Positive  # Learning rate.
 
 
@@ -92,8 +94,11 @@ class XPlanesLoss(Settings):
     # code, also along time, summed over planes.
     variation: Literal["mean", "coded"]
     total_variation: Weight  # Weight of the space planes' total variation.
-    # Replaces `model.loss.total_variation` if a background is learnt.
+    # Replaces `model.loss.total_variation` in moving scenes if a background is learnt.
     total_variation_with_background: Weight
+    # Number of camera positions for which these weights are meant. With fewer they are larger in
+    # inverse proportion, unless an LRM initialises the field; null: never.
+    variation_views: Count | None
     # Factor on the three weights of time planes below if a background is learnt.
     time_factor_with_background: Share
     time_variation: Weight  # Weight of the time planes' total variation.
@@ -272,9 +277,11 @@ class XPlanesModel(Model):
             self.weights = settings.loss.with_learnt_background()
             if site.initialised:  # Its surfaces stop light already.
                 self.weights = replace(self.weights, passing=0.0)
+        if field.background is not None and field.moves:
             self.total_variation = self.weights.total_variation_with_background
         elif self.fine_settings is not None:
             self.total_variation = self.fine_settings.coarse_variation
+        self.total_variation *= self._few_views(site)
         views = len(site.times)
         steps = self.weights.initial_steps
         self.fade = None if steps is None else steps / views / site.batch_scale
@@ -309,6 +316,14 @@ class XPlanesModel(Model):
     @property
     def sparse(self) -> Tensor | None:
         return None if self.product is None else self.product.sparse
+
+    def _few_views(self, site: Site) -> float:
+        """Factor on total variation: the fewer the images, the more a prior must tell."""
+        wanted = self.weights.variation_views
+        if wanted is None or site.views is None or site.initialised:
+            return 1.0
+        positions = site.views.camera_to_world[:, :3, 3].unique(dim=0)
+        return max(1.0, wanted / len(positions))
 
     def groups(self) -> list[Group]:
         field, settings = self._field, self.settings

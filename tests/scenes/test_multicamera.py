@@ -211,27 +211,38 @@ def test_folders_of_cameras_may_have_other_names_and_levels(videos, tmp_path, ou
     require_all(read(tmp_path, test_cameras=[name.format(0)]))
 
 
-@pytest.mark.parametrize("calibration", ["poses", "transforms", "folders", "colmap"])
-@pytest.mark.parametrize("what", ["images", "clip.mp4"])
-def test_sources_of_one_name_in_folders_of_cameras(images, calibration, what):
+def in_folders(images: Path, what: str, name: str) -> None:
+    """Frames of each camera as images or a video in its folder, with masks beside them."""
     for camera in range(CAMERAS):
-        shutil.rmtree(folder := images / f"cam{camera:02d}")
-        folder.mkdir()
-        (write_images if what == "images" else write_video)(folder / what, rgb(camera))
+        shutil.rmtree(images / f"cam{camera:02d}")
+        folder = images / name.format(camera)
+        write_images(folder / "masks", rgb(camera))
         if what == "images":
-            shutil.copytree(folder / what, folder / "masks")
-    first = f"cam{{:02d}}/{what}" + "/5.png" * (what == "images")
+            write_images(folder / what, rgb(camera))
+        else:
+            write_video(folder / what, rgb(camera))
+            (folder / f"._{what}").write_bytes(b"")
+
+
+@pytest.mark.parametrize("calibration", ["poses", "transforms", "folders", "colmap", "below"])
+@pytest.mark.parametrize("what", ["images", "clip.mp4"])
+@pytest.mark.parametrize("name", ["cam{:02d}", "Camera.{:03d}"])
+def test_sources_of_one_name_in_folders_of_cameras(images, calibration, what, name):
+    in_folders(images, what, name)
     if calibration != "poses":
         (images / "poses_bounds.npy").unlink()
-    if calibration == "colmap":
-        with_colmap(images, "cam{:02d}/images/5.png")
+    if calibration in ("transforms", "folders"):
+        inner = f"/{what}" + "/5.png" * (what == "images")
+        with_transforms(images, name + inner * (calibration == "transforms"))
     elif calibration != "poses":
-        with_transforms(images, first if calibration == "transforms" else "cam{:02d}")
+        with_colmap(images, f"{name}/images/5.png" if calibration == "below" else f"{name}.png")
     require_recognised(images)
-    found = read(images)
-    assert {file.split("/")[0] for file in found.splits["test"].files} == {"cam00"}
+    found = read(images, test_cameras=[name.format(0)])
+    assert {file.split("/")[0] for file in found.splits["test"].files} == {name.format(0)}
     require_rays_of(found.splits["test"], list(range(FRAMES)))
     assert len(found.splits["train"]) == len(VIEWS) - FRAMES
+    shown = found.splits["test"].in_memory()[..., :3].float()
+    assert (shown - torch.from_numpy(rgb(0)).float()).abs().mean() < 6  # And no masks.
 
 
 @pytest.mark.parametrize("names", ["Camera Camera.001 Camera.002", "cam cam2", "cam_left cam_top2"])

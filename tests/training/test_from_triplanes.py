@@ -34,6 +34,7 @@ from xplanes.scenes.frame import Frame
 from xplanes.streams import TrainingState
 from xplanes.tools.evaluate import evaluate
 from xplanes.tools.runs import load_run
+from xplanes.training.building import parts_from, site_content
 from xplanes.training.module import RadianceModule
 
 AXES = ("xy", "xz", "yz")
@@ -214,6 +215,7 @@ def test_a_field_that_starts_again_keeps_l_r_while_it_is_of_use(built):
     [
         (["data.views=2", "lrm=none"], 1.2),
         (["data.views=4", "lrm=none"], 0.6),
+        (["data.views=2", "lrm=none", "model.loss.variation_views=50"], 3.0),
         (["lrm=none"], 0.3),
         (["data.views=2", "lrm=none", "model.loss.variation_views=null"], 0.3),
         (["data.views=2"], 0.3),
@@ -221,8 +223,11 @@ def test_a_field_that_starts_again_keeps_l_r_while_it_is_of_use(built):
 )
 def test_random_planes_are_smoother_where_few_cameras_look(built, overrides, weight):
     smooth = ["model.loss.total_variation=0.3", "model.fine=null", "model.loss.variation_views=8"]
-    model = built(*smooth, *overrides).model
-    assert model.total_variation == pytest.approx(weight)
+    module = built(*smooth, *overrides)
+    assert module.model.total_variation == pytest.approx(weight)
+    loaded = parts_from(site_content(module.parts), module.method, (), None).model
+    assert isinstance(loaded, XPlanesModel)
+    assert loaded.total_variation == pytest.approx(weight)
 
 
 def test_total_variation_has_a_weight_for_the_planes_of_space_and_one_for_those_of_time(built):

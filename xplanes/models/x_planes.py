@@ -41,6 +41,9 @@ from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
 from xplanes.streams import Stream, TrainingState, initial_values, step_generator
 
+MOST_SMOOTH = 10.0
+"""Largest factor on total variation where few cameras look."""
+
 FINE_WARMUP = 100
 """Warm-up steps of the fine planes' learning rate."""
 
@@ -96,8 +99,9 @@ class XPlanesLoss(Settings):
     total_variation: Weight  # Weight of the space planes' total variation.
     # Replaces `model.loss.total_variation` in moving scenes if a background is learnt.
     total_variation_with_background: Weight
-    # Number of camera positions for which these weights are meant. With fewer they are larger in
-    # inverse proportion, unless an LRM initialises the field; null: never.
+    # Number of camera positions for which the weights of the coarse space planes are meant. With
+    # fewer they are larger in inverse proportion, up to tenfold, unless an LRM initialises the
+    # field; null: never.
     variation_views: Count | None
     # Factor on the three weights of time planes below if a background is learnt.
     time_factor_with_background: Share
@@ -320,10 +324,9 @@ class XPlanesModel(Model):
     def _few_views(self, site: Site) -> float:
         """Factor on total variation: the fewer the images, the more a prior must tell."""
         wanted = self.weights.variation_views
-        if wanted is None or site.views is None or site.initialised:
+        if wanted is None or site.positions is None or site.initialised:
             return 1.0
-        positions = site.views.camera_to_world[:, :3, 3].unique(dim=0)
-        return max(1.0, wanted / len(positions))
+        return min(max(1.0, wanted / site.positions), MOST_SMOOTH)
 
     def groups(self) -> list[Group]:
         field, settings = self._field, self.settings

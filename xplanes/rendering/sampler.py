@@ -46,6 +46,7 @@ class Site:
         bounds: Lower and upper corner of the field's box in the world; None for fields that need
             none. [2, 3]
         views: Training views; None if a checkpoint is loaded without its data.
+        positions: Number of positions of the training cameras; None if unknown.
         initialised: Whether the initial field already shows the scene.
         pixels: Image pixels that a side of the field's cube covers, see `pixels_of_detail`.
         surrounded: Whether the training images show surroundings, which lie behind the field's
@@ -63,6 +64,7 @@ class Site:
     precision: str
     bounds: Tensor | None = None
     views: Views | None = None
+    positions: int | None = None
     initialised: bool = False
     pixels: float = 0.0
     surrounded: bool = False

@@ -218,8 +218,9 @@ def _recording(camera: Camera) -> Recording:
     images = images_in(camera.source)
     if not images:
         raise SceneError(
-            f"{camera.source} holds no images ({', '.join(ENDINGS)}), nor does a folder in it. Add "
-            f"the frames of the camera, or take it out of the calibration ({camera.label})."
+            f"{camera.source} holds no images ({', '.join(ENDINGS)}), nor does a folder in it, "
+            "nor is there a single video. Add the frames of the camera, or take it out of the "
+            f"calibration ({camera.label})."
         )
     first = f"{images[0]} of the same camera"
     size = shared_size(images, first, "Export its frames alike.")

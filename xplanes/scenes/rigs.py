@@ -94,21 +94,24 @@ def read_cameras(folder: Path) -> tuple[list[Camera], Mapping[str, Any]]:
             f"camera) nor {MODELS[0]} (COLMAP's model of an image of each), but {found}. Add the "
             "calibration of the cameras."
         )
-    cameras = [replace(camera, source=_with_frames(camera.source)) for camera in cameras]
-    return _named_apart(cameras), content
+    cameras = _named_apart(cameras)
+    names = [camera.name for camera in cameras]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise SceneError(
+            f"{folder}: several cameras are called {twice[0]}. Rename their videos or folders."
+        )
+    return [replace(camera, source=with_frames(camera.source)) for camera in cameras], content
 
 
 def _named_apart(cameras: Sequence[Camera]) -> list[Camera]:
-    """Cameras of equal names are called by the folders in which their sources differ."""
-    if len({camera.name for camera in cameras}) == len(cameras):
+    """Cameras of equal names are called by the folders in which they differ (cam0/images)."""
+    folders = [camera.source.parts[:-1] for camera in cameras]
+    levels = [level for level in zip(*folders, strict=False) if len({*level}) > 1]
+    if len({camera.name for camera in cameras}) == len(cameras) or not levels:
         return list(cameras)
-    paths = [camera.source.parts for camera in cameras]
-    deepest = max(map(len, paths))
-    levels = zip(*([*path, *[""] * (deepest - len(path))] for path in paths), strict=True)
-    different = zip(*(level for level in levels if len({*level}) > 1), strict=True)
     return [
-        replace(camera, name="_".join(filter(None, parts)))
-        for camera, parts in zip(cameras, different, strict=True)
+        replace(camera, name="_".join(parts))
+        for camera, parts in zip(cameras, zip(*levels, strict=True), strict=True)
     ]
 
 
@@ -118,7 +121,7 @@ def recordings_of_cameras(folder: Path) -> list[Path]:
     numbered = [path for path in inside if NUMBERED.fullmatch(camera_name(path))]
     named = [path for path in inside if CAMERAS.match(camera_name(path))]
     counted = [path for path in named if re.search(r"\d", camera_name(path))]
-    named = [path for path in named if path in counted or path.is_file() or images_in(path)]
+    named = [path for path in named if path in counted or _is_filled(path)]
     return named if counted or len(named) > 1 else numbered
 
 
@@ -160,10 +163,10 @@ def is_rig(folder: Path) -> bool:
     sources: set[Path] = set()
     try:
         for frame in read_frames(folder / TRANSFORMS)["frames"]:
-            source = _source("", folder.resolve(), frame["file_path"])
+            source = with_frames(_source("", folder.resolve(), frame["file_path"]))
             if source in sources:
                 return False
-            if _with_frames(source).is_dir():
+            if source.is_dir():
                 kinds = [kind(path.name) for path in images_in(source)]
                 if len({*kinds}) == len(kinds):
                     return False
@@ -176,6 +179,11 @@ def is_rig(folder: Path) -> bool:
 def camera_name(path: Path) -> str:
     """Name of the camera of a folder, or of a video, whose ending is no part of it."""
     return path.stem if path.suffix.lower() in videos.SUFFIXES else path.name
+
+
+def _is_filled(path: Path) -> bool:
+    """Whether a recording is a video, or a folder with images or one video."""
+    return with_frames(path).is_file() or bool(images_in(path))
 
 
 def _is_recording(path: Path) -> bool:
@@ -249,7 +257,7 @@ def _from_transforms(folder: Path, content: Mapping[str, Any]) -> list[Camera]:
         label = f"{path}: frame {index} ({frame['file_path']})"
         source = _source(label, folder.resolve(), frame["file_path"])
         pose = checked_pose(label, frame["transform_matrix"])
-        if (other := cameras.get(source)) is not None:
+        if (other := cameras.get(with_frames(source))) is not None:
             if np.abs(other.pose - pose).max() > SAME_POSE:
                 raise SceneError(
                     f"{label} has another pose than {other.label}, but both lead to {source}, "
@@ -257,7 +265,8 @@ def _from_transforms(folder: Path, content: Mapping[str, Any]) -> list[Camera]:
                 )
             continue
         calibration = read_calibration(str(path), content, label, frame)
-        cameras[source] = Camera(camera_name(source), source, pose, calibration, label)
+        camera = Camera(camera_name(source), source, pose, calibration, label)
+        cameras[with_frames(source)] = camera
     warn_of_unknown(path, content, UNREAD)
     return list(cameras.values())
 
@@ -281,13 +290,15 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
         model.names, model.camera_to_world, model.calibrations, strict=True
     ):
         image = PurePosixPath(name)
-        outer = [folder.name for folder in image.parents if sources[folder.name]]
         found = [
             path
-            for text in dict.fromkeys((image.stem, *outer[:1]))
+            for text in dict.fromkeys((image.stem, image.parent.name))
             # A video may be beside a folder of images extracted from it.
             for path in [path for path in sources[text] if path.is_file()] or sources[text]
         ]
+        if not set(found) & set(expected):  # cam00/images/0001.png
+            outer = {parent.name for parent in image.parents}
+            found = [path for path in recordings if path.name in outer] or found
         for path in found:
             owned.setdefault(path, []).append(name)
             label = f"{model.source}: {name}"
@@ -302,7 +313,8 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
     if problems:
         raise SceneError(
             f"{model.source}: {some(problems)}. One image of each camera must be registered, and "
-            "have its name: cam00.png or cam00/0001.png for cam00.mp4, or for the folder cam00. "
+            "have its name: cam00.png, cam00/0001.png or cam00/images/0001.png for cam00.mp4, or "
+            "for the folder cam00. "
             f"Registered images: {some(model.names)}. Videos, and folders of the name cam*, in "
             f"{folder}: {some([path.name for path in expected]) or 'none'}. Move what is not a "
             "camera elsewhere, or read all registered images with data=colmap."
@@ -344,12 +356,15 @@ def _source(label: str, folder: Path, name: Any) -> Path:
     return source
 
 
-def _with_frames(source: Path) -> Path:
-    """A camera's source, or the only video in its folder if that has no images."""
-    if source.is_file() or images_in(source):
+def with_frames(source: Path) -> Path:
+    """A camera's source, or the only video in its folder if no images lie beside it."""
+    if source.is_file():
         return source
-    inside = [path for path in source.iterdir() if path.suffix.lower() in videos.SUFFIXES]
-    return inside[0] if len(inside) == 1 else source
+    inside = [path for path in source.iterdir() if path.is_file() and path.name[0] != "."]
+    if any(map(is_image, inside)):
+        return source
+    found = [path for path in inside if path.suffix.lower() in videos.SUFFIXES]
+    return found[0] if len(found) == 1 else source
 
 
 def images_in(folder: Path) -> list[Path]:

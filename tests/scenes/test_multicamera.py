@@ -263,6 +263,38 @@ def test_cameras_may_have_an_image_of_another_kind(images):
     assert MultiCameraSettings.recognises(images)
 
 
+@pytest.mark.parametrize(
+    "other", ["{}_mask.png", "depth_{:05d}.png", "segmentation_{}.png", "{}.jpg", "background.png"]
+)
+def test_images_of_other_kinds_beside_frames_are_left_out(images, other):
+    for camera in range(CAMERAS):
+        for number in range(5, 5 + FRAMES):
+            save(images / f"cam{camera:02d}" / other.format(number), rgb(camera)[0] // 2)
+    with told("no frames beside 5."):
+        found = read(images)
+    require_rays_of(found.splits["test"], list(range(FRAMES)))
+    if not other.endswith("jpg"):  # Of two formats, either may stay.
+        require_all(found)
+
+
+def test_frames_have_the_number_that_varies(images):
+    for camera in range(CAMERAS):
+        for path in sorted((images / f"cam{camera:02d}").iterdir()):
+            path.rename(path.with_name(f"birthday_{path.stem}_{camera:02d}.png"))
+    for camera, gone in ((1, 6), (2, 7)):
+        (images / f"cam{camera:02d}" / f"birthday_{gone}_{camera:02d}.png").unlink()
+    with told("cam01/birthday_7_01.png, cam02/birthday_6_02.png"):
+        found = read(images)
+    assert len(found.splits["test"]) == FRAMES - 2
+
+
+def test_cameras_without_simultaneous_frames_are_refused(images):
+    for camera in range(CAMERAS):
+        for place, path in enumerate(sorted((images / f"cam{camera:02d}").iterdir())):
+            path.rename(path.with_name(f"{1700000000000 + 40 * place + camera}.png"))
+    refuse(images, r"no number is in the names of images of all cameras \(cam00/1700000000000.png")
+
+
 def test_folders_of_single_views_are_no_cameras(tmp_path):
     for view, what in ((view, what) for view in range(CAMERAS) for what in ("rgb", "depth_0")):
         save(tmp_path / f"{view:04d}" / f"{what}.png", rgb(view)[0])

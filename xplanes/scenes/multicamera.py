@@ -27,12 +27,12 @@ from xplanes.scenes.images import (
     shrink,
 )
 from xplanes.scenes.listing import final_intrinsics, misshapen
-from xplanes.scenes.name_times import DATE
+from xplanes.scenes.name_times import DATE, most_different
 from xplanes.scenes.rigs import (
     POSES,
     Camera,
     are_registered,
-    images_in,
+    frames_in,
     is_rig,
     read_cameras,
     recordings_below,
@@ -215,7 +215,7 @@ def _recording(camera: Camera) -> Recording:
     """The frames of a camera, read from headers only."""
     if camera.source.is_file():
         return Recording(camera, *videos.read_header(camera.source))
-    images = images_in(camera.source)
+    images = frames_in(camera.source)
     if not images:
         raise SceneError(
             f"{camera.source} holds no images ({', '.join(ENDINGS)}), nor does a folder in it, "
@@ -275,15 +275,22 @@ def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
     """
     numbers: dict[int, list[int]] = {}
     for camera, recording in enumerate(recordings):
-        found = [re.findall(r"\d+", path.stem) for path in recording.images]
-        if found and all(found):
-            numbers[camera] = [int(digits[-1]) for digits in found]
+        stems = [path.stem for path in recording.images]
+        if stems and (found := most_different(stems)):
+            numbers[camera] = [int(number) for number in found]
     each = list(numbers.values())
     if not each or any(len({*own}) < len(own) for own in each):
         return list(recordings)
     if max(own[0] for own in each) > min(own[-1] for own in each):
         numbers = {camera: [n - own[0] for n in own] for camera, own in numbers.items()}
     common = set.intersection(*map(set, numbers.values()))
+    if not common:
+        pairs = [(camera, recordings[camera].images[0]) for camera in numbers]
+        shown = some([f"{recordings[camera].camera.name}/{path.name}" for camera, path in pairs])
+        raise SceneError(
+            f"{recordings[0].camera.source.parent}: no number is in the names of images of all "
+            f"cameras ({shown}), so that none are simultaneous. Number simultaneous images alike."
+        )
     lost = {
         f"{recordings[camera].camera.name}/{path.name}"
         for camera, own in numbers.items()

@@ -69,7 +69,7 @@ def times_in_names(names: Sequence[str]) -> list[Number]:
     paths = [PurePosixPath(name).with_suffix("").as_posix() for name in names]
     files, whole = ([CAMERA.sub("", text) for text in texts] for texts in (stems, paths))
     for texts in (files, whole, stems):
-        found = _most_different(texts)
+        found = most_different(texts)
         if len(set(found)) > 1 or (found and len(names) == 1):
             break
     if why := _no_series(names, stems, found):
@@ -115,7 +115,7 @@ def _clock(stem: str) -> float | None:
     return float(f"{match[1]}.{match[2]}" if match[1] else match[0])
 
 
-def _most_different(texts: Sequence[str]) -> list[Number]:
+def most_different(texts: Sequence[str]) -> list[Number]:
     """The number in each name at the position where numbers vary most, or the last such position.
 
     If names have different counts of numbers, the last number of each, if that varies more. Numbers

@@ -44,6 +44,11 @@ TIMESTEPS = "mv_images"
 UNREAD = ("mask_path", *TRANSPARENT, "train_filenames", "val_filenames", "test_filenames")
 """Keys of transforms files that are read of captures, but not of several fixed cameras."""
 
+OTHER_KINDS = re.compile(
+    r"(?i)(?<![a-z])(masks?|mattes?|depths?|disp|seg|segmentations?|normals?|flow)(?![a-z])"
+)
+"""Part of the names of images that show something else than colours."""
+
 IMAGES = ("images", "image", "rgb", "frames")
 """Names of the subfolder with a camera's images, if the camera has several subfolders."""
 
@@ -156,10 +161,6 @@ def is_rig(folder: Path) -> bool:
     If so, they are cameras rather than the images of a capture. A folder whose images are all of
     different kinds, such as rgb.png beside depth.png, is a view of a capture.
     """
-
-    def kind(name: str) -> str:
-        return re.sub(r"\d+", "#", PurePosixPath(name).stem)
-
     sources: set[Path] = set()
     try:
         for frame in read_frames(folder / TRANSFORMS)["frames"]:
@@ -167,7 +168,7 @@ def is_rig(folder: Path) -> bool:
             if source in sources:
                 return False
             if source.is_dir():
-                kinds = [kind(path.name) for path in images_in(source)]
+                kinds = [_kind(path) for path in images_in(source)]
                 if len({*kinds}) == len(kinds):
                     return False
             sources.add(source)
@@ -367,12 +368,33 @@ def with_frames(source: Path) -> Path:
     return found[0] if len(found) == 1 else source
 
 
+def _kind(path: Path) -> str:
+    """Name of an image without its numbers, which images of one kind share."""
+    return re.sub(r"\d+", "#", path.stem)
+
+
+def frames_in(folder: Path) -> list[Path]:
+    """The images of a folder that are a camera's frames; warns of the others.
+
+    Left out are masks, depths and the like beside images of another kind, images without a number
+    beside those with one, and copies in another format.
+    """
+    images = images_in(folder)
+    kept = [path for path in images if not OTHER_KINDS.search(path.stem)] or images
+    kept = [path for path in kept if "#" in _kind(path)] or kept
+    kept = list({path.stem: path for path in reversed(kept)}.values())[::-1]
+    if left := [path.name for path in images if path not in kept]:
+        warn(f"{folder}: {some(left)}: no frames beside {kept[0].name}. {len(left)} are left out.")
+    return kept
+
+
 def images_in(folder: Path) -> list[Path]:
     """Images of a folder, or of its only subfolder, in the order of the numbers in their names."""
     inside = sorted(folder.iterdir(), key=lambda path: natural(path.name))
     if found := [path for path in inside if is_image(path)]:
         return found
     folders = [path for path in inside if path.is_dir() and path.name[0] != "."]
+    folders = [path for path in folders if not OTHER_KINDS.search(path.name)]
     named = [path for path in folders if path.name.lower() in IMAGES]
     folders = named if len(folders) > 1 else folders
     return images_in(folders[0]) if len(folders) == 1 else []

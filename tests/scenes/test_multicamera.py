@@ -277,6 +277,17 @@ def test_images_of_other_kinds_beside_frames_are_left_out(images, other):
         require_all(found)
 
 
+def test_captures_tell_of_videos_that_are_not_read(copied):
+    for camera in range(CAMERAS):
+        save(copied / "images" / f"GX{camera:02d}.png", rgb(camera)[0])
+        (copied / f"cam{camera:02d}.mp4").rename(copied / f"GX{camera:02d}.mp4")
+    (copied / "poses_bounds.npy").unlink()
+    with_transforms(copied, "images/GX{:02d}.png")
+    assert not MultiCameraSettings.recognises(copied)
+    with told("GX00.mp4, GX01.mp4, .* 4 videos are not read.*data=multicamera"):
+        settings(NerfstudioSettings, "nerfstudio", copied).load(["train"])
+
+
 def test_frames_have_the_number_that_varies(images):
     for camera in range(CAMERAS):
         for path in sorted((images / f"cam{camera:02d}").iterdir()):

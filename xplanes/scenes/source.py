@@ -18,6 +18,7 @@ from xplanes.scenes.frame import CubeHints
 from xplanes.scenes.images import GREY
 from xplanes.scenes.listing import Listing, read_views
 from xplanes.scenes.masks import MaskUse, chosen_use, survey
+from xplanes.scenes.videos import SUFFIXES as VIDEOS
 from xplanes.scenes.views import Scene, Views, joined, spread
 from xplanes.settings import Count, Location, Positive, Settings
 
@@ -89,6 +90,18 @@ def warn_of_masks(folder: Path, images: Sequence[Path]) -> None:
             f"{folder}: {names} is not read. If these are masks of the images, name their folder "
             f"(data.masks={place.name}, of colmap and nerfies), or their files (mask_path of "
             "the frames in transforms files)."
+        )
+
+
+def warn_of_videos(folder: Path) -> None:
+    """Warn about several videos in a capture's folder, or in one inside, which are not read."""
+    places = [folder, *(path for path in folder.iterdir() if path.is_dir())]
+    inside = [path for place in places for path in place.iterdir() if path.name[0] != "."]
+    found = sorted(path.name for path in inside if path.suffix.lower() in VIDEOS)
+    if len(found) > 1:
+        warn(
+            f"{folder}: {some(found)}: {len(found)} videos are not read, only images are. If they "
+            "are those of several fixed cameras, read them with data=multicamera."
         )
 
 
@@ -362,6 +375,7 @@ class CaptureSettings(SceneSettings, ABC):
                 )
         if not any(listing.masks):
             warn_of_masks(self.folder, listing.paths)
+        warn_of_videos(self.folder)
         turn, words = world_turn(listing.camera_to_world, listing.paths, self.orient, up)
         found = None if points is None else torch.from_numpy(points - np.array(listing.origin))
         if turn is not None:

@@ -95,9 +95,9 @@ def warn_of_masks(folder: Path, images: Sequence[Path]) -> None:
 
 def warn_of_videos(folder: Path) -> None:
     """Warn about several videos in a capture's folder, or in one inside, which are not read."""
-    places = [folder, *(path for path in folder.iterdir() if path.is_dir())]
-    inside = [path for place in places for path in place.iterdir() if path.name[0] != "."]
-    found = sorted(path.name for path in inside if path.suffix.lower() in VIDEOS)
+    inside = [path for pattern in ("*", "*/*") for path in folder.glob(pattern)]
+    inside = [path for path in inside if path.suffix.lower() in VIDEOS and path.name[0] != "."]
+    found = sorted(path.name for path in inside)
     if len(found) > 1:
         warn(
             f"{folder}: {some(found)}: {len(found)} videos are not read, only images are. If they "

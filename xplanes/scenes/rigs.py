@@ -5,6 +5,7 @@ transforms.json that names each camera's video, its folder of images, or one of 
 model of COLMAP that has registered one image per camera, with the name of the camera.
 """
 
+import functools
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -254,11 +255,12 @@ def _from_transforms(folder: Path, content: Mapping[str, Any]) -> list[Camera]:
     """Cameras of transforms.json: one frame per camera, or several with the same pose."""
     path = folder / TRANSFORMS
     cameras: dict[Path, Camera] = {}
+    content_of = functools.cache(with_frames)  # Many frames may be of one camera.
     for index, frame in enumerate(content["frames"]):
         label = f"{path}: frame {index} ({frame['file_path']})"
         source = _source(label, folder.resolve(), frame["file_path"])
         pose = checked_pose(label, frame["transform_matrix"])
-        if (other := cameras.get(with_frames(source))) is not None:
+        if (other := cameras.get(content_of(source))) is not None:
             if np.abs(other.pose - pose).max() > SAME_POSE:
                 raise SceneError(
                     f"{label} has another pose than {other.label}, but both lead to {source}, "
@@ -267,7 +269,7 @@ def _from_transforms(folder: Path, content: Mapping[str, Any]) -> list[Camera]:
             continue
         calibration = read_calibration(str(path), content, label, frame)
         camera = Camera(camera_name(source), source, pose, calibration, label)
-        cameras[with_frames(source)] = camera
+        cameras[content_of(source)] = camera
     warn_of_unknown(path, content, UNREAD)
     return list(cameras.values())
 
@@ -381,9 +383,10 @@ def frames_in(folder: Path) -> list[Path]:
     """
     images = images_in(folder)
     kept = [path for path in images if not OTHER_KINDS.search(path.stem)] or images
-    kept = [path for path in kept if "#" in _kind(path)] or kept
+    kept = [path for path in kept if re.search(r"\d", path.stem)] or kept
     kept = list({path.stem: path for path in reversed(kept)}.values())[::-1]
-    if left := [path.name for path in images if path not in kept]:
+    used = {*kept}
+    if left := [path.name for path in images if path not in used]:
         warn(f"{folder}: {some(left)}: no frames beside {kept[0].name}. {len(left)} are left out.")
     return kept
 

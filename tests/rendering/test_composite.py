@@ -15,6 +15,7 @@ from xplanes.rendering.compositing import (
     composite_reference,
     depth_before,
     distortion,
+    sample_weights,
 )
 
 try:
@@ -57,7 +58,8 @@ def expected_of(depth, colour, distances, ray, starts):
 def spread(depth, colour, distances, ray, starts, end, step):
     total, _ = composite(depth, colour, distances, ray, starts)
     ends = torch.full((len(starts),), end, dtype=depth.dtype)
-    return distortion(depth, distances, ray, starts, total, ends, step)
+    weights = sample_weights(depth, ray, starts)
+    return distortion(weights, distances, ray, starts, total, ends, step)
 
 
 def test_distortion_is_the_mean_distance_of_two_photons():

@@ -222,8 +222,9 @@ def test_random_points_of_occupied_cells_pay_for_their_opacity():
         assert float(field.density.grad) == pytest.approx(times * once, rel=1e-6), steps
 
 
-def test_fog_before_a_background_pays_for_its_distortion():
-    settings = settings_of(distortion=0.5, coarse_first=False)
+@pytest.mark.parametrize(("term", "other"), [("distortion", "border"), ("border", "distortion")])
+def test_fog_before_a_background_pays_for_its_distortion_and_for_the_border(term, other):
+    settings = settings_of(**{term: 0.5, other: 0.0}, coarse_first=False)
     batch = dict(zip(("origins", "directions", "times"), rays_of(8), strict=True))
     batch |= {"background": WHITE.expand(8, 3), "jitter": batch["times"]}
     state = TrainingState(0, 1, 1, 0)
@@ -235,14 +236,31 @@ def test_fog_before_a_background_pays_for_its_distortion():
 
     site = Site(cube_frame(1.0, torch.zeros(3)), torch.zeros(12), 0, "32")
     assert terms(settings.with_constant_background(site)) == {}
-    found = terms(settings.with_learnt_background())["distortion"]
-    measured = renderer_of(distorted=True).render(fog(level), *rays_of(8), WHITE, batch["times"])
-    assert measured.distortion is not None
-    assert float(found.detach()) == pytest.approx(
-        0.5 * float(measured.distortion.detach()), rel=1e-12
-    )
-    found.backward()
+    found = terms(settings.with_learnt_background())
+    assert set(found) == {term}
+    measured = renderer_of(surrounded=True).render(fog(level), *rays_of(8), WHITE, batch["times"])
+    expected = 0.5 * float(getattr(measured, term).detach())
+    assert float(found[term].detach()) == pytest.approx(expected, rel=1e-12)
+    found[term].backward()
     assert level.grad != 0
+
+
+@pytest.mark.parametrize(("centre", "half"), [(0.0, 0.1), (0.7, 0.1), (0.0, 1.0)])
+def test_what_is_near_the_faces_of_the_cube_costs_most(centre, half):
+    """A ray along x, offset from the axis, through fog between two walls."""
+    density, renderer = 3.0, renderer_of(2048, surrounded=True, skip_empty=False, occlusion=0.0)
+
+    def field(points, times):
+        inside = (points[:, 0] - centre).abs() <= half
+        return COLOUR.expand(len(points), 3), density * inside.to(points)
+
+    origins = torch.tensor([[-3.0, 0.25, -0.6]], dtype=torch.float64)
+    directions = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
+    found = renderer.render(field, origins, directions, torch.zeros(1).double(), WHITE).border
+    places = torch.linspace(centre - half, centre + half, 100_001, dtype=torch.float64)
+    light = density * torch.exp(-density * (places - places[0]))
+    wanted = torch.trapezoid(light * places.abs().clamp_min(0.6) ** 4, places)
+    assert float(found) == pytest.approx(float(wanted), rel=0.01)
 
 
 def test_points_of_occupied_cells_lie_in_all_of_them_and_in_no_others():

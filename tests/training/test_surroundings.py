@@ -103,7 +103,7 @@ def test_a_world_gets_a_background_and_the_planes_are_initialised_as_ever():
             value = value - torch.tensor([0.0, 1.0, 1.0, 1.0])
         torch.testing.assert_close(value, with_.state_dict()[name])
     same_parameters([*with_.model.groups(), *with_.sampler.groups()], with_.parameters())
-    expected = "colour passing distortion unseen exposures"
+    expected = "colour passing distortion border unseen exposures"
     assert set(terms(with_, "world")) == set(expected.split())
 
 

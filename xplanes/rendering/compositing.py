@@ -99,8 +99,23 @@ def depth_before(optical_depth: Tensor, ray: Tensor, starts: Tensor) -> Tensor:
     return total - total.index_select(0, starts[ray])
 
 
+def sample_weights(optical_depth: Tensor, ray: Tensor, starts: Tensor) -> Tensor:
+    """The weights of `composite` with gradients, for losses on them.
+
+    Args:
+        optical_depth: Density times length of each sample, as in `composite`. [N]
+        ray: Ray of each sample, ascending. [N]
+        starts: Index of each ray's first sample, or of the next ray's if it has none. [R]
+
+    Returns:
+        Weights. [N]
+    """
+    depth = optical_depth.clamp(0, OPAQUE)
+    return depth_before(depth, ray, starts).neg().exp().to(depth.dtype) * stopped(depth)
+
+
 def distortion(
-    optical_depth: Tensor,
+    weights: Tensor,
     distances: Tensor,
     ray: Tensor,
     starts: Tensor,
@@ -114,7 +129,7 @@ def distortion(
     at one surface, and large for fog or a semi-transparent surface in front of another.
 
     Args:
-        optical_depth: Density times length of each sample, as in `composite`. [N]
+        weights: Weights of the samples, from `sample_weights`. [N]
         distances: Distance of each sample from the ray's origin. [N]
         ray: Ray of each sample, ascending. [N]
         starts: Index of each ray's first sample, or of the next ray's if it has none. [R]
@@ -123,18 +138,18 @@ def distortion(
         step: Length of a sample.
 
     Returns:
-        In units of ``distances``, differentiable with respect to optical depths. []
+        In units of ``distances``, differentiable with respect to weights. []
 
     Source: Mip-NeRF 360, Eq. 15, with the transmitted light as one more sample.
     """
-    depth = optical_depth.clamp(0, OPAQUE)
-    weights = depth_before(depth, ray, starts).neg().exp().to(depth.dtype) * stopped(depth)
     # Pairs in which each sample is the farther one, and pairs within a sample.
     pairs = distances * depth_before(weights, ray, starts)
     pairs = weights * (pairs - depth_before(weights * distances, ray, starts))
     within = weights.square() * (step / 3)
     passing = (1 - total[:, 3]) * (total[:, 3] * ends - total[:, 4])
-    return (2 * (pairs.sum() + passing.sum()) + within.sum()).to(depth.dtype) / max(1, len(starts))
+    return (2 * (pairs.sum() + passing.sum()) + within.sum()).to(weights.dtype) / max(
+        1, len(starts)
+    )
 
 
 class _Composite(torch.autograd.Function):

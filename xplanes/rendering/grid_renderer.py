@@ -14,7 +14,7 @@ from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.behind import behind
 from xplanes.rendering.box import Field, ray_box, shade
-from xplanes.rendering.compositing import composite, distortion
+from xplanes.rendering.compositing import composite, distortion, sample_weights
 from xplanes.rendering.front_to_back import front_to_back
 from xplanes.rendering.marching import Rays, march
 from xplanes.rendering.occupancy import OccupancyGrid
@@ -59,6 +59,9 @@ DIAGONAL = 2 * math.sqrt(3)
 BEHIND = 0.5
 """Distance behind the cube at which the distortion loss places the background."""
 
+BORDER = 4
+"""Power of the distance from the cube's centre in the border loss; its faces are at 1."""
+
 
 @dataclass(frozen=True)
 class GridRendering(Rendering):
@@ -66,9 +69,12 @@ class GridRendering(Rendering):
 
     Attributes:
         distortion: Result of `compositing.distortion`; None if not computed. []
+        border: Mean over rays of the weights times ``max(|x|, |y|, |z|) ** BORDER``; None if not
+            computed. []
     """
 
     distortion: Tensor | None
+    border: Tensor | None
 
 
 @dataclass(frozen=True)
@@ -82,7 +88,7 @@ class GridRenderer(RayRenderer):
         occlusion: Transmittance below which samples are skipped; 0 skips none. Estimated from the
             grid, except for images on the CPU, where it comes from the field.
         room: Number of memory slots for samples, see `march`.
-        distorted: Whether to compute the distortion.
+        surrounded: Whether to compute the losses of scenes with surroundings.
         thinning: Subsample gradients below this times the mean, see `thinned`.
     """
 
@@ -91,7 +97,7 @@ class GridRenderer(RayRenderer):
     skip_empty: bool = True
     occlusion: float = 0.001
     room: int | None = None
-    distorted: bool = False
+    surrounded: bool = False
     thinning: float = 0.0
 
     @property
@@ -161,13 +167,16 @@ class GridRenderer(RayRenderer):
             # A ray without slots shows only the background, which must not learn from it.
             background = torch.where(samples.shown[:, None], background, background.detach())
         colour, opacity, depth = _pixels(total, background)
-        spread = None
-        if self.distorted:
+        spread = border = None
+        if self.surrounded:
             ends = ray_box(origins, directions)[1] + BEHIND
+            weights = sample_weights(density * self.step, samples.ray, samples.starts)
             along = samples.distances, samples.ray, samples.starts, total
-            spread = distortion(density * self.step, *along, ends, self.step)
+            spread = distortion(weights, *along, ends, self.step)
+            outwards = samples.points.detach().abs().amax(dim=1).pow(BORDER)
+            border = (weights * outwards).sum() / max(1, len(times))
         seen = colour, opacity, depth.detach(), density.detach(), samples
-        return GridRendering(*seen, distortion=spread)
+        return GridRendering(*seen, distortion=spread, border=border)
 
     def pixels(
         self, field: Any, origins: Tensor, directions: Tensor, times: Tensor, background: Tensor
@@ -246,6 +255,9 @@ class OccupancySettings(SamplerSettings):
     # Weight of the distortion loss (Mip-NeRF 360), which turns fog into surfaces. 0 unless a
     # background is learnt.
     distortion: Weight
+    # Weight of the opacity near the cube's faces, which leaves to the background what few cameras
+    # see there. 0 unless a background is learnt.
+    border: Weight
     # Steps at which all occupied cells are updated. Only the last one if a background is learnt,
     # which would take over the content of cells that are emptied too early.
     sweep_at: list[int]
@@ -315,7 +327,7 @@ class OccupancySettings(SamplerSettings):
         return OccupancySampler(renderer, settings, site.samples_per_batch, fill_seconds)
 
     def with_constant_background(self, site: Site) -> "OccupancySettings":
-        """Settings for a constant background: sweeps scaled to the batch size, no distortion loss.
+        """Settings for a constant background: sweeps scaled to the batch size, no losses of fog.
 
         Updates of random cells are not scaled, because large batches reach more cells anyway.
         """
@@ -324,6 +336,7 @@ class OccupancySettings(SamplerSettings):
             sweep_at=[site.steps(step) for step in self.sweep_at],
             sweep_every=site.steps(self.sweep_every),
             distortion=0.0,
+            border=0.0,
         )
 
     def with_learnt_background(self) -> "OccupancySettings":
@@ -373,8 +386,10 @@ class OccupancySampler(Sampler):
     ) -> None:
         self.settings, self.grid, self.most_samples = settings, renderer.grid, most_samples
         self.fill_seconds = fill_seconds
-        distorted = settings.distortion > 0
-        self._training_renderer = replace(renderer, distorted=distorted, thinning=settings.thinning)
+        surrounded = max(settings.distortion, settings.border) > 0
+        self._training_renderer = replace(
+            renderer, surrounded=surrounded, thinning=settings.thinning
+        )
         self._image_renderer = replace(renderer, samples=settings.render_samples)
         self.expect(math.inf)
 
@@ -421,9 +436,14 @@ class OccupancySampler(Sampler):
         )
 
     def losses(self, rendering: GridRendering) -> dict[str, Tensor]:
-        if rendering.distortion is None:
+        if rendering.distortion is None or rendering.border is None:
             return {}
-        return {"distortion": self.settings.distortion * rendering.distortion}
+        terms = {}
+        if weight := self.settings.distortion:
+            terms["distortion"] = weight * rendering.distortion
+        if weight := self.settings.border:
+            terms["border"] = weight * rendering.border
+        return terms
 
     def observe(self, rendering: Rendering) -> None:
         samples = rendering.samples

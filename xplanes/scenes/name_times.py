@@ -183,9 +183,10 @@ def _is_grid(names: Sequence[str], times: Sequence[Number]) -> bool:
     """Whether names differ in their time and in another part, a camera, with all pairs of both."""
     rest = []
     for name, time in zip(names, times, strict=True):
-        others = Counter(map(int, re.findall(NUMBER, name)))
-        others.subtract([time])
-        rest.append((re.sub(r"\d+", "#", name), *sorted(others.elements())))
+        others = [int(number) for number in re.findall(NUMBER, name)]
+        if time in others:
+            others.remove(int(time))
+        rest.append((re.sub(r"\d+", "#", name), *sorted(others)))
     pairs, counts = {*zip(rest, times, strict=True)}, (len({*rest}), len({*times}))
     return min(counts) > 1 and len(pairs) == len(names) == math.prod(counts)
 

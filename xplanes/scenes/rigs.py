@@ -7,7 +7,7 @@ model of COLMAP that has registered one image per camera, with the name of the c
 
 import functools
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -22,7 +22,14 @@ from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, image_c
 from xplanes.scenes.entries import checked_pose, is_positive, paths_inside, reading, some
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import Calibration
-from xplanes.scenes.transforms import TRANSPARENT, read_calibration, read_frames, warn_of_unknown
+from xplanes.scenes.masks import MASKS
+from xplanes.scenes.transforms import (
+    TIMES,
+    TRANSPARENT,
+    read_calibration,
+    read_frames,
+    warn_of_unknown,
+)
 
 POSES = "poses_bounds.npy"
 TRANSFORMS = "transforms.json"
@@ -42,11 +49,15 @@ STATIC = "none, as in LLFF's static captures (data.static=false takes those in t
 TIMESTEPS = "mv_images"
 """Folder with a subfolder for each timestep, as in Nvidia's Dynamic Scenes."""
 
-UNREAD = ("mask_path", *TRANSPARENT, "train_filenames", "val_filenames", "test_filenames")
+UNREAD = (
+    *("mask_path", *TRANSPARENT, *TIMES),
+    *("train_filenames", "val_filenames", "test_filenames"),
+)
 """Keys of transforms files that are read of captures, but not of several fixed cameras."""
 
 OTHER_KINDS = re.compile(
-    r"(?i)(?<![a-z])(masks?|mattes?|depths?|disp|seg|segmentations?|normals?|flow)(?![a-z])"
+    r"(?i)(?<![a-z])(masks?|mattes?|silhouettes?|depths?|disp|seg|segmentations?|normals?|flow)"
+    r"(?![a-z])"
 )
 """Part of the names of images that show something else than colours."""
 
@@ -124,6 +135,7 @@ def _named_apart(cameras: Sequence[Camera]) -> list[Camera]:
 def recordings_of_cameras(folder: Path) -> list[Path]:
     """Videos and folders called cam*, else those with numbers such as 00 or view_01, by name."""
     inside = sorted(filter(_is_recording, folder.iterdir()))
+    inside = [path for path in inside if not OTHER_KINDS.search(camera_name(path))] or inside
     numbered = [path for path in inside if NUMBERED.fullmatch(camera_name(path))]
     named = [path for path in inside if CAMERAS.match(camera_name(path))]
     counted = [path for path in named if re.search(r"\d", camera_name(path))]
@@ -152,6 +164,7 @@ def recordings_below(folder: Path, *others: str) -> list[Path]:
         return found
     others = (TIMESTEPS, *others)
     inside = [path for path in folder.iterdir() if path.is_dir() and path.name not in others]
+    inside = [path for path in inside if not OTHER_KINDS.search(path.name)]
     deeper = [paths for path in inside if (paths := recordings_of_cameras(path))]
     return deeper[0] if len(deeper) == 1 else []
 
@@ -288,6 +301,13 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
     expected = sorted(expected | set(recordings))
     sources |= _counted(model, recordings)
     owned: dict[Path, list[str]] = {path: [] for path in expected}
+    folders = Counter(PurePosixPath(name).parent for name in model.names)
+    if len(folders) > 1 and min(folders.values()) > 1:
+        raise SceneError(
+            f"{model.source} has several images of each camera, such as {some(model.names)}. Read "
+            "them all, at the times in their names, with data=colmap; data=multicamera reads the "
+            "frames of cameras of which one image is registered."
+        )
     cameras, problems = [], []
     for name, pose, calibration in zip(
         model.names, model.camera_to_world, model.calibrations, strict=True
@@ -376,7 +396,7 @@ def _kind(path: Path) -> str:
 
 
 def frames_in(folder: Path) -> list[Path]:
-    """The images of a folder that are a camera's frames; warns of the others.
+    """The images of a folder that are a camera's frames; warns of the others, but for masks.
 
     Left out are masks, depths and the like beside images of another kind, images without a number
     beside those with one, and copies in another format.
@@ -386,7 +406,8 @@ def frames_in(folder: Path) -> list[Path]:
     kept = [path for path in kept if re.search(r"\d", path.stem)] or kept
     kept = list({path.stem: path for path in reversed(kept)}.values())[::-1]
     used = {*kept}
-    if left := [path.name for path in images if path not in used]:
+    left = [path.name for path in images if path not in used and not MASKS.search(path.name)]
+    if left:
         warn(f"{folder}: {some(left)}: no frames beside {kept[0].name}. {len(left)} are left out.")
     return kept
 

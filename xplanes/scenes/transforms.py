@@ -406,9 +406,10 @@ def warn_of_unknown(path: Path, content: Mapping[str, Any], unread: Sequence[str
         if _has_content(value) or "color" in key  # Zeros in a colour mean black.
     }
     if unknown := sorted(given - ({*KNOWN, *IGNORED} - {*unread})):
+        other = " data=nerfstudio reads times, masks and splits." if {*unread} & {*unknown} else ""
         warn(
             f"{path}: keys that are not read are {', '.join(map(short, unknown))}. If one of them "
-            "affects the images or cameras, convert these and remove the key."
+            f"affects the images or cameras, convert these and remove the key.{other}"
         )
 
 
@@ -555,6 +556,8 @@ def read_calibration(
         # The frame's field of view replaces the file's focal lengths.
         shared = {key: value for key, value in shared.items() if key not in ("fl_x", "fl_y")}
         name, keys = label, frame
+    elif "fl_x" in own:
+        shared.pop("fl_y", None)  # As in instant-ngp, a frame's fl_x alone means square pixels.
     known = shared | own
     model, distortion = _lens(where, content, label, frame)
     bare = Calibration(model=model, distortion=distortion)

@@ -34,6 +34,7 @@ from xplanes.scenes.rigs import (
     Camera,
     are_registered,
     frames_in,
+    is_calibrated,
     is_rig,
     read_cameras,
     recordings_below,
@@ -59,8 +60,8 @@ class MultiCameraSettings(SceneSettings):
     """Synchronised videos of several fixed cameras."""
 
     files: ClassVar = (
-        "videos or folders cam00, cam01, ... with poses_bounds.npy, a model of COLMAP, or a "
-        "transforms.json with a frame of each"
+        "videos or folders cam00, cam01, ... with poses_bounds.npy, a model of COLMAP, a "
+        "transforms.json with a frame of each, or EasyMocap's extri.yml"
     )
 
     frames: list[int] | None  # First frame, last frame and stride; null for all frames.
@@ -90,7 +91,7 @@ class MultiCameraSettings(SceneSettings):
     def recognises(cls, folder: Path) -> bool:
         if (folder / POSES).is_file():
             return bool(recordings_below(folder))
-        return is_rig(folder) or are_registered(folder)
+        return is_rig(folder) or are_registered(folder) or is_calibrated(folder)
 
     def load(self, splits: Sequence[str]) -> Scene:
         if self.train_on_video:

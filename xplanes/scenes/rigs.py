@@ -1,8 +1,9 @@
 """The cameras of a rig: which videos or folders are theirs, and their calibration.
 
 A calibration is poses_bounds.npy (Neural 3D Video), with rows in the order of the cameras' names; a
-transforms.json that names each camera's video, its folder of images, or one of these images; or a
-model of COLMAP that has registered one image per camera, with the name of the camera.
+transforms.json that names each camera's video, its folder of images, or one of these images; a
+model of COLMAP that has registered one image per camera, with the name of the camera; or a file of
+another program (`calibrations`).
 """
 
 import functools
@@ -18,6 +19,7 @@ import numpy as np
 from xplanes.errors import SceneError, warn
 from xplanes.files import natural
 from xplanes.scenes import videos
+from xplanes.scenes.calibrations import find_calibration, read_calibrations
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, image_count, read_model
 from xplanes.scenes.entries import checked_pose, is_positive, paths_inside, reading, some
 from xplanes.scenes.formats import is_image
@@ -104,12 +106,14 @@ def read_cameras(folder: Path) -> tuple[list[Camera], Mapping[str, Any]]:
         cameras = _from_transforms(folder, content)
     elif (model := find_model(folder)) is not None:
         cameras = _from_colmap(folder, model)
+    elif (path := find_calibration(folder)) is not None:
+        cameras = _from_calibration(folder, path)
     else:
         found = ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "nothing"
         raise SceneError(
             f"{folder} holds neither {POSES} (Neural 3D Video) nor {TRANSFORMS} (a frame for each "
-            f"camera) nor {MODELS[0]} (COLMAP's model of an image of each), but {found}. Add the "
-            "calibration of the cameras."
+            f"camera) nor {MODELS[0]} (COLMAP's model of an image of each) nor extri.yml "
+            f"(EasyMocap), but {found}. Add the calibration of the cameras."
         )
     cameras = _named_apart(cameras)
     names = [camera.name for camera in cameras]
@@ -156,6 +160,23 @@ def are_registered(folder: Path) -> bool:
         return place is not None
     found = recordings_below(folder, "images")
     return len(found) > 1 and 1 < image_count(place) <= len(found)
+
+
+def is_calibrated(folder: Path) -> bool:
+    """Whether a folder has a calibration of another program, and recordings, alone."""
+    if any(folder.glob("transforms*.json")) or find_model(folder) or not find_calibration(folder):
+        return False
+    return len(_recordings_of_any_name(folder)) > 1
+
+
+def _recordings_of_any_name(folder: Path) -> dict[str, Path]:
+    """Videos, or else folders of images, in a folder or in one inside, by camera."""
+    inside = [path for path in folder.iterdir() if path.is_dir() and path.name[0] != "."]
+    places = [folder, *(path for path in inside if not OTHER_KINDS.search(path.name))]
+    found = [path for place in places for path in sorted(filter(_is_recording, place.iterdir()))]
+    # EasyMocap extracts images from videos, and programs write folders of the same names.
+    found.sort(key=lambda path: (path.is_file(), path.parent.name.lower() in IMAGES))
+    return {camera_name(path).removeprefix("hd_"): path for path in found if _is_filled(path)}
 
 
 def recordings_below(folder: Path, *others: str) -> list[Path]:
@@ -341,6 +362,28 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
             f"Registered images: {some(model.names)}. Videos, and folders of the name cam*, in "
             f"{folder}: {some([path.name for path in expected]) or 'none'}. Move what is not a "
             "camera elsewhere, or read all registered images with data=colmap."
+        )
+    return cameras
+
+
+def _from_calibration(folder: Path, path: Path) -> list[Camera]:
+    """Those cameras of another program's calibration that have a recording."""
+    known, sources = read_calibrations(path), _recordings_of_any_name(folder)
+    cameras = [
+        Camera(each.name, sources[each.name], each.pose, each.calibration, each.label)
+        for each in known
+        if each.name in sources
+    ]
+    lost = [each.name for each in known if each.name not in sources]
+    if not cameras:
+        raise SceneError(
+            f"{path}: none of its cameras has a video or a folder of images of its name, such as "
+            f"images/{lost[0]} or videos/{lost[0]}.mp4. Add them to {folder}."
+        )
+    if lost:
+        warn(
+            f"{path}: {len(lost)} of {len(known)} cameras have no video or folder of images of "
+            f"their name and are left out: {some(lost)}."
         )
     return cameras
 

@@ -121,7 +121,8 @@ class SceneSettings(Settings, ABC):
     name: str  # Name of the format in run directories and tables.
     root: Location  # Folder that holds the scenes.
     scene: Location  # Folder of the scene, or name of the demo scene.
-    resolution: Count | None  # Width of the images in pixels; null keeps the native size.
+    # Width of the images in pixels, or theirs if that is less; null keeps the native size.
+    resolution: Count | None
     views: Count | None  # Training views, spread over time; null for all.
     train_on_video: bool  # Also train on the frames of the fixed camera.
     static: bool | None  # Static scene; null: static if the fixed camera's frames are equal.

@@ -235,7 +235,7 @@ def test_frames_that_cannot_be_used_are_left_out_and_named(scene):
 
 def test_all_that_is_wrong_is_said_at_once(scene):
     scene.change(1, transform_matrix=3)
-    scene.change(2, file_path=None)
+    scene.change(2, file_path=3)
     scene.refused("frame 1", "frame 2")
 
 

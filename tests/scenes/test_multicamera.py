@@ -167,6 +167,21 @@ def test_videos_of_neural_3d_video(videos):
         assert int(torch.stack(gaps).argmin()) == number
 
 
+@pytest.mark.parametrize("place", ["GX01{:04d}.MP4", "iphone-{}.mp4", "videos/cam{:02d}.mp4"])
+def test_videos_of_other_names_or_beside_their_images(copied, place):
+    (copied / place).parent.mkdir(exist_ok=True)
+    names = [place.format(camera) for camera in range(CAMERAS)]
+    for camera, name in enumerate(names):
+        (copied / f"cam{camera:02d}.mp4").rename(copied / name)
+        if "/" in name:
+            write_images(copied / "images" / Path(name).stem, rgb(camera))
+    (copied / "._GX010000.MP4").write_bytes(b"")
+    require_recognised(copied)
+    found = read(copied, test_cameras=[Path(names[0]).stem])
+    require_rays_of(found.splits["test"], list(range(FRAMES)))
+    assert not (found.splits["test"].in_memory() == VIEWS.in_memory()[:FRAMES]).all()  # Videos.
+
+
 def test_folders_of_images_keep_every_pixel(images):
     for name in ("camera_paths", "mv_images/00000", "mv_images/00001"):  # Which are no cameras.
         write_images(images / name, rgb(0)[:1])

@@ -179,6 +179,12 @@ def test_times_in_any_unit_are_mapped_over_all_frames(capture, caplog, key, firs
         assert views.times.tolist() == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.parametrize("zone", ["Z", "", "+02:00"])
+def test_dates_are_times(capture, zone):
+    capture.timed([f"2026-01-02T11:59:{50 + number * 0.25:05.2f}0{zone}" for number in range(10)])
+    assert capture.all().times.tolist() == pytest.approx([number / 9 for number in range(10)])
+
+
 def test_times_from_0_to_1_stay(capture, caplog):
     capture.timed([0.1 + i / 20 for i in range(10)])
     with caplog.at_level(logging.INFO, logger="xplanes"):

@@ -5,9 +5,9 @@ All three give rotations and translations from the world to cameras with OpenCV'
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,17 +26,11 @@ MATRIX = re.compile(
 )
 """A matrix, or a height or width, in a YAML file of OpenCV."""
 
+Camera = tuple[str, Any, Any, dict[str, Any]]
+"""Name, rotation and translation from the world, and keys as of a transforms file."""
+
 BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's order of coefficients of perspective lenses."""
-
-
-class Calibrated(NamedTuple):
-    """A camera of a rig: its name, its label for messages, its pose, and its lens."""
-
-    name: str
-    label: str
-    pose: np.ndarray
-    calibration: Calibration
 
 
 def find_calibration(folder: Path) -> Path | None:
@@ -44,8 +38,8 @@ def find_calibration(folder: Path) -> Path | None:
     return next((path for pattern in FILES for path in sorted(folder.glob(pattern))), None)
 
 
-def read_calibrations(path: Path) -> list[Calibrated]:
-    """The cameras of a calibration.
+def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibration]]:
+    """Name, label, pose and calibration of each camera.
 
     Args:
         path: Result of `find_calibration`.
@@ -54,29 +48,21 @@ def read_calibrations(path: Path) -> list[Calibrated]:
         SceneError: If the file is not such a calibration.
     """
     advice = "Export it again, or write a transforms.json with a frame of each camera."
+    cameras = []
     with reading(path, "as the calibration of cameras", advice):
         try:
-            content = decoded(path.read_bytes())
             read = _easymocap if path.suffix == ".yml" else _in_json
-            return [_camera(path, name, keys, motion) for name, motion, keys in read(path, content)]
+            for name, rotation, shift, keys in read(path, decoded(path.read_bytes())):
+                label, turn = f"{path}: {name}", np.array(rotation, dtype=np.float64)
+                turn = turn if turn.size == 9 else _rotation(turn.ravel())
+                pose = np.eye(4)
+                pose[:3, :3] = turn.T * [1, -1, -1]
+                pose[:3, 3] = -turn.T @ np.array(shift, dtype=np.float64).ravel()
+                calibration = read_calibration(label, {}, label, keys)
+                cameras.append((name, label, checked_pose(label, pose, "the pose"), calibration))
         except (LookupError, TypeError) as problem:
             raise ValueError(f"an entry is missing or of another kind: {problem}") from problem
-
-
-Entry = tuple[str, tuple[Any, Any], dict[str, Any]]
-"""A camera's name, its rotation and translation from the world, and its keys."""
-
-
-def _camera(path: Path, name: str, keys: Mapping[str, Any], motion: tuple[Any, Any]) -> Calibrated:
-    label = f"{path}: {name}"
-    rotation, shift = (np.array(part, dtype=np.float64) for part in motion)
-    if rotation.size == 3:
-        rotation = _rotation(rotation.ravel())
-    pose = np.eye(4)
-    pose[:3, :3] = rotation.T * [1, -1, -1]
-    pose[:3, 3] = -rotation.T @ shift.ravel()
-    calibration = read_calibration(label, {}, label, keys)
-    return Calibrated(name, label, checked_pose(label, pose, "the pose"), calibration)
+    return cameras
 
 
 def _rotation(vector: np.ndarray) -> np.ndarray:
@@ -95,7 +81,7 @@ def _lens(matrix: Any, distortion: Any) -> dict[str, Any]:
     return {"camera_model": "FULL_OPENCV", **sides, **dict(given)}
 
 
-def _easymocap(path: Path, content: str) -> Iterable[Entry]:
+def _easymocap(path: Path, content: str) -> Iterable[Camera]:
     found: dict[tuple[str, str], Any] = {}
     for text in (content, decoded(path.with_name("intri.yml").read_bytes())):
         for kind, name, rows, columns, data, side, owner, length in MATRIX.findall(text):
@@ -111,18 +97,16 @@ def _easymocap(path: Path, content: str) -> Iterable[Entry]:
         rotation = found["Rot", name] if ("Rot", name) in found else found["R", name]
         distortion = found.get(("dist", name), found.get(("D", name), []))
         size = {key.lower(): found[key, name] for key in "WH" if (key, name) in found}
-        yield name, (rotation, found["T", name]), _lens(found["K", name], distortion) | size
+        yield name, rotation, found["T", name], _lens(found["K", name], distortion) | size
 
 
-def _in_json(path: Path, content: str) -> Iterable[Entry]:
+def _in_json(path: Path, content: str) -> Iterable[Camera]:
     cameras = json.loads(content)
     if isinstance(cameras, dict):  # Of CMU Panoptic.
         for camera in cameras["cameras"]:
             size = dict(zip("wh", camera["resolution"], strict=True))
-            yield (
-                *(camera["name"], (camera["R"], camera["t"])),
-                _lens(camera["K"], camera["distCoef"]) | size,
-            )
+            lens = _lens(camera["K"], camera["distCoef"])
+            yield camera["name"], camera["R"], camera["t"], lens | size
         return
     for camera in cameras:
         if camera["projection_type"] != "fisheye":
@@ -135,4 +119,4 @@ def _in_json(path: Path, content: str) -> Iterable[Entry]:
         keys |= {"w": camera["width"], "h": camera["height"]}
         keys |= dict(zip(("k1", "k2"), camera["radial_distortion"], strict=False))
         rotation = _rotation(np.array(camera["orientation"], dtype=np.float64))
-        yield camera["name"], (rotation, -rotation @ np.array(camera["position"])), keys
+        yield camera["name"], rotation, -rotation @ np.array(camera["position"]), keys

@@ -136,12 +136,8 @@ def final_sizes(
             f"images or cameras, which keep their size: {path} is {width} pixels wide. Set at most "
             f"{width} for equal widths, or null for the native size."
         )
-    return [
-        (height, width)
-        if width <= resolution
-        else (max(1, round(height * resolution / width)), resolution)
-        for height, width in native
-    ]
+    kept = [(height, width, min(width, resolution)) for height, width in native]
+    return [(max(1, round(height * less / width)), less) for height, width, less in kept]
 
 
 def read_images(

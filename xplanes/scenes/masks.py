@@ -24,7 +24,7 @@ alpha: empty space; ignore: pixels to ignore; lrm: removed only from the LRM's i
 space if masks look like silhouettes, else pixels to ignore.
 """
 
-MASKS = re.compile(r"(?i)mask|matte|silhouette")
+MASKS = re.compile(r"(?i)mask|(?<![a-z])mattes?(?![a-z])|silhouette")
 """Part of the names of masks."""
 
 SURVEYED = 32

@@ -37,7 +37,7 @@ from xplanes.scenes.rigs import (
     is_calibrated,
     is_rig,
     read_cameras,
-    recordings_below,
+    recordings_of_rows,
 )
 from xplanes.scenes.source import SceneSettings, warn_of_masks
 from xplanes.scenes.transforms import stated_up
@@ -90,7 +90,7 @@ class MultiCameraSettings(SceneSettings):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         if (folder / POSES).is_file():
-            return bool(recordings_below(folder))
+            return bool(recordings_of_rows(folder))
         return is_rig(folder) or are_registered(folder) or is_calibrated(folder)
 
     def load(self, splits: Sequence[str]) -> Scene:
@@ -280,18 +280,11 @@ def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
     Raises:
         SceneError: If images are missing, and other cameras have videos.
     """
-    numbers: dict[int, list[Number]] = {}
-    clocks: set[int] = set()
-    for camera, recording in enumerate(recordings):
-        if not recording.images:
-            continue
-        found = times_of_clocks([path.name for path in recording.images])
-        if found and len({*found}) == len(found):
-            clocks.add(camera)
-        else:
-            found = most_different([path.stem for path in recording.images])
-        if found:
-            numbers[camera] = found
+    numbers = {
+        camera: found
+        for camera, recording in enumerate(recordings)
+        if recording.images and (found := _numbers(recording.images))
+    }
     each = list(numbers.values())
     if not each or any(len({*own}) < len(own) for own in each):
         return list(recordings)
@@ -308,13 +301,14 @@ def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
             f"nearest differ by less than {NEAR:g} of the interval between images, so that none "
             "are simultaneous. Number simultaneous images alike."
         )
-    chosen = {
-        camera: found[common].tolist() for camera, found in zip(numbers, partners, strict=True)
-    }
+    chosen = [
+        tuple(recordings[camera].images[place] for place in found[common])
+        for camera, found in zip(numbers, partners, strict=True)
+    ]
     lost = {
         f"{recordings[camera].camera.name}/{path.name}"
-        for camera, kept in chosen.items()
-        for path in {*recordings[camera].images} - {recordings[camera].images[at] for at in kept}
+        for camera, kept in zip(numbers, chosen, strict=True)
+        for path in {*recordings[camera].images} - {*kept}
     }
     if lost:
         text = (
@@ -335,14 +329,18 @@ def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
             _warn_of_gaps(recordings[camera], own)
         return list(recordings)
     shared = tuple(next(iter(numbers.values()))[place] for place in common)
-    simultaneous = []
-    for camera, kept in chosen.items():
-        images = tuple(recordings[camera].images[place] for place in kept)
-        times = shared if camera in clocks or _are_series(images) else ()
-        simultaneous.append(
-            replace(recordings[camera], count=len(kept), images=images, times=times)
-        )
-    return simultaneous
+    timed = isinstance(shared[0], float)  # Of clocks.
+    times = [shared if timed or _are_series(images) else () for images in chosen]
+    return [
+        replace(recording, count=len(common), images=images, times=own)
+        for recording, images, own in zip(recordings, chosen, times, strict=True)
+    ]
+
+
+def _numbers(images: Sequence[Path]) -> list[Number]:
+    """Times of clocks in the images' names, as floats, if they differ; else whole numbers."""
+    times = times_of_clocks([path.name for path in images])
+    return times if len({*times}) == len(images) else most_different([p.stem for p in images])
 
 
 def _counts(recordings: Sequence[Recording]) -> str:

@@ -187,7 +187,18 @@ def recordings_below(folder: Path, *others: str) -> list[Path]:
     inside = [path for path in folder.iterdir() if path.is_dir() and path.name not in others]
     inside = [path for path in inside if not OTHER_KINDS.search(path.name)]
     deeper = [paths for path in inside if (paths := recordings_of_cameras(path))]
+    if len(deeper) > 1:  # Of videos and images extracted from them, videos are read.
+        named = [paths for paths in deeper if paths[0].parent.name.lower() in IMAGES]
+        deeper = [paths for paths in deeper if all(map(Path.is_file, paths))] or named
     return deeper[0] if len(deeper) == 1 else []
+
+
+def recordings_of_rows(folder: Path) -> list[Path]:
+    """Recordings with rows in poses_bounds.npy: of any name if there are only videos."""
+    inside = sorted(path for path in folder.iterdir() if path.name[0] != ".")
+    loose = [path for path in inside if path.suffix.lower() in videos.SUFFIXES]
+    others = len(loose) < 2 or any(path.name.startswith("images") for path in inside)
+    return recordings_below(folder) or ([] if others else loose)
 
 
 def is_rig(folder: Path) -> bool:
@@ -230,7 +241,7 @@ def _from_poses_bounds(folder: Path) -> list[Camera]:
     """Cameras of poses_bounds.npy; its rows are in the order of the videos' or folders' names."""
     path = folder / POSES
     # A video may be beside a folder of images extracted from it.
-    sources = list({camera_name(source): source for source in recordings_below(folder)}.values())
+    sources = list({camera_name(source): source for source in recordings_of_rows(folder)}.values())
     names = [source.name for source in sources]
     if names != sorted(names, key=natural):
         pairs = ", ".join(f"row {row} is {name}" for row, name in enumerate(names[:3]))
@@ -368,13 +379,12 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
 
 def _from_calibration(folder: Path, path: Path) -> list[Camera]:
     """Those cameras of another program's calibration that have a recording."""
-    known, sources = read_calibrations(path), _recordings_of_any_name(folder)
-    cameras = [
-        Camera(each.name, sources[each.name], each.pose, each.calibration, each.label)
-        for each in known
-        if each.name in sources
-    ]
-    lost = [each.name for each in known if each.name not in sources]
+    sources, cameras, lost = _recordings_of_any_name(folder), [], []
+    for name, label, pose, calibration in read_calibrations(path):
+        if (source := sources.get(name)) is None:
+            lost.append(name)
+        else:
+            cameras.append(Camera(name, source, pose, calibration, label))
     if not cameras:
         raise SceneError(
             f"{path}: none of its cameras has a video or a folder of images of its name, such as "
@@ -382,8 +392,8 @@ def _from_calibration(folder: Path, path: Path) -> list[Camera]:
         )
     if lost:
         warn(
-            f"{path}: {len(lost)} of {len(known)} cameras have no video or folder of images of "
-            f"their name and are left out: {some(lost)}."
+            f"{path}: {len(lost)} of {len(lost) + len(cameras)} cameras have no video or folder of "
+            f"images of their name and are left out: {some(lost)}."
         )
     return cameras
 

@@ -83,7 +83,7 @@ def warn_of_masks(folder: Path, images: Sequence[Path], advice: str = "") -> Non
         for place in {folder, *places, *above}
         for path in place.iterdir()
         if MASKS.search(path.name) and path not in used
-        if path.is_dir() or is_image(path) or path.suffix.lower() in VIDEOS
+        if path.is_dir() or is_image(path) or (advice and path.suffix.lower() in VIDEOS)
     )
     if found:
         names = some([path.as_posix().removeprefix(f"{folder.as_posix()}/") for path in found])
@@ -96,20 +96,15 @@ def warn_of_masks(folder: Path, images: Sequence[Path], advice: str = "") -> Non
 
 
 def warn_of_videos(folder: Path, images: Sequence[Path]) -> None:
-    """Warn about several videos in a capture's folder, or in one inside, which are not read.
-
-    Args:
-        folder: The scene's folder.
-        images: Its images.
-    """
+    """Warn about several videos in a capture's folder, or in one inside, but for its images."""
     inside = [path for pattern in ("*", "*/*") for path in folder.glob(pattern)]
     inside = [path for path in inside if path.suffix.lower() in VIDEOS and path.name[0] != "."]
     found = sorted(path.name for path in inside)
     if len(found) > 1:
-        kept = {path.stem for path in images} <= {path.stem for path in inside}
-        told = "Each image has the name of one" if kept else "If they are of several fixed cameras"
+        alike = {path.stem for path in images} <= {path.stem for path in inside}
+        when = "Each image has the name of one" if alike else "If they are of several fixed cameras"
         warn(
-            f"{folder}: {some(found)}: {len(found)} videos are not read, only images are. {told}: "
+            f"{folder}: {some(found)}: {len(found)} videos are not read, only images are. {when}: "
             "read them with data=multicamera."
         )
 

@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -433,6 +434,10 @@ def _standard(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
     for key in {*NUMBERS} & {*found}:
         if isinstance(found[key], str) and (number := number_in(found[key])) is not None:
             found[key] = number
+    for key in {*TIMES} & {*found}:
+        with suppress(TypeError, ValueError):  # Of numbers, and of other text.
+            date = datetime.fromisoformat(found[key])
+            found[key] = (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
     for key in {*FLAGS} & {*found}:
         if isinstance(found[key], str) and found[key].lower() in ("true", "false"):
             found[key] = found[key].lower() == "true"

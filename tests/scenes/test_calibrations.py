@@ -130,6 +130,13 @@ def test_cameras_without_frames_are_told_of(tmp_path, kind):
         assert len(read(tmp_path).splits["train"]) == 9
 
 
+def test_files_of_other_names_or_contents_are_no_calibrations(tmp_path):
+    build(tmp_path, "immersive")
+    (tmp_path / "models.json").write_text('["a/000000.png", {"camera_0001": 1}]')
+    assert not MultiCameraSettings.recognises(tmp_path)
+    refused(partial(read, tmp_path), "models.json cannot be read as the calibration of cameras")
+
+
 @pytest.mark.parametrize(
     ("kind", "old", "new", "words"),
     [

@@ -163,10 +163,13 @@ def are_registered(folder: Path) -> bool:
 
 
 def is_calibrated(folder: Path) -> bool:
-    """Whether a folder has a calibration of another program, and recordings, alone."""
-    if any(folder.glob("transforms*.json")) or find_model(folder) or not find_calibration(folder):
+    """Whether another program's calibration is the only one, and names two recordings or more."""
+    path = find_calibration(folder)
+    if path is None or any(folder.glob("transforms*.json")) or find_model(folder):
         return False
-    return len(_recordings_of_any_name(folder)) > 1
+    text = path.read_text(encoding="utf-8", errors="replace")
+    names = _recordings_of_any_name(folder)
+    return sum(bool(re.search(rf'["_]{re.escape(name)}\b', text)) for name in names) > 1
 
 
 def _recordings_of_any_name(folder: Path) -> dict[str, Path]:

@@ -255,15 +255,19 @@ def test_a_model_or_images_that_are_not_where_they_are_said_to_be(capture):
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_the_largest_of_several_models_is_read(capture, caplog, text):
-    capture.write(text=text, model="sparse/1")
-    capture.write(keep=range(3))
-    assert len(capture.views()) == 8
-    assert "sparse/1 is read, which has the most images (0 has 3, 1 has 8)" in caplog.text
-    caplog.clear()
-    SceneDataModule(capture.settings(), seed=0).setup("fit")
-    assert caplog.text.count("could not join them all") == 1
-    for path in (capture.path / "sparse/1").glob("images.*"):
+@pytest.mark.parametrize("place", ["sparse", "colmap/sparse"])
+def test_the_largest_of_several_models_is_read(capture, text, place):
+    shutil.rmtree(capture.path / "sparse")
+    capture.write(text=text, model=f"{place}/1")
+    capture.write(keep=range(3), model=f"{place}/0")
+    assert ColmapSettings.recognises(capture.path)
+    words = r"sparse holds 2 models.*/1 is read, .*most images \(0 has 3, 1 has 8\).*data\.model"
+    with told(words):
+        assert len(capture.views()) == 8
+    with pytest.warns(UserWarning, match="could not join them all") as caught:
+        SceneDataModule(capture.settings(), seed=0).setup("fit")
+    assert len(caught) == 1
+    for path in (capture.path / place / "1").glob("images.*"):
         path.write_bytes(b"7 damaged")
     assert len(capture.views()) == 3
 

@@ -292,7 +292,7 @@ def test_a_frames_own_keys_go_before_the_files(tmp_path):
     narrow = focal_length(0.5, 12)
     cases = [
         ({}, [30, 33], [6.5, 9]),
-        ({"fl_x": 20.0}, [20, 33], [6.5, 9]),
+        ({"fl_x": 20.0}, [20, 20], [6.5, 9]),  # As in instant-ngp, whose pixels are then square.
         ({"fl_x": 20.0, "fl_y": 22.0, "cx": 5.0, "cy": 7.5}, [20, 22], [5, 7.5]),
         ({"camera_angle_x": 0.5}, [narrow, narrow], [6.5, 9]),
         ({"w": 24, "h": 36}, [15, 16.5], [3.25, 9]),

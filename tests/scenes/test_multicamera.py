@@ -1,7 +1,6 @@
 """Videos of several fixed cameras, written from rendered views and read back."""
 
 import json
-import logging
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -168,6 +167,21 @@ def test_videos_of_neural_3d_video(videos):
         assert int(torch.stack(gaps).argmin()) == number
 
 
+@pytest.mark.parametrize("place", ["GX01{:04d}.MP4", "iphone-{}.mp4", "videos/cam{:02d}.mp4"])
+def test_videos_of_other_names_or_beside_their_images(copied, place):
+    (copied / place).parent.mkdir(exist_ok=True)
+    names = [place.format(camera) for camera in range(CAMERAS)]
+    for camera, name in enumerate(names):
+        (copied / f"cam{camera:02d}.mp4").rename(copied / name)
+        if "/" in name:
+            write_images(copied / "images" / Path(name).stem, rgb(camera))
+    (copied / "._GX010000.MP4").write_bytes(b"")
+    require_recognised(copied)
+    found = read(copied, test_cameras=[Path(names[0]).stem])
+    require_rays_of(found.splits["test"], list(range(FRAMES)))
+    assert not (found.splits["test"].in_memory() == VIEWS.in_memory()[:FRAMES]).all()  # Videos.
+
+
 def test_folders_of_images_keep_every_pixel(images):
     for name in ("camera_paths", "mv_images/00000", "mv_images/00001"):  # Which are no cameras.
         write_images(images / name, rgb(0)[:1])
@@ -237,12 +251,30 @@ def test_sources_of_one_name_in_folders_of_cameras(images, calibration, what, na
     elif calibration != "poses":
         with_colmap(images, f"{name}/images/5.png" if calibration == "below" else f"{name}.png")
     require_recognised(images)
-    found = read(images, test_cameras=[name.format(0)])
+    with told(r"scene: \S+0/masks, \S+1/masks, .* is not read.*alpha channel"):
+        found = read(images, test_cameras=[name.format(0)])
     assert {file.split("/")[0] for file in found.splits["test"].files} == {name.format(0)}
     require_rays_of(found.splits["test"], list(range(FRAMES)))
     assert len(found.splits["train"]) == len(VIEWS) - FRAMES
     shown = found.splits["test"].in_memory()[..., :3].float()
     assert (shown - torch.from_numpy(rgb(0)).float()).abs().mean() < 6  # And no masks.
+
+
+@pytest.mark.parametrize(
+    ("mask", "outer"), [("masks/cam{:02d}", "images"), ("cam{:02d}_mask.mp4", ""), ("matte", "rgb")]
+)
+def test_masks_of_a_rig_are_no_cameras_and_told_of(images, mask, outer):
+    if outer:
+        move(images, outer)
+    for camera in range(CAMERAS):
+        path = images / mask.format(camera)
+        if path.suffix:
+            path.write_bytes(b"")
+        else:
+            write_images(path, rgb(camera))
+    require_recognised(images)
+    with told("scene: (masks|matte|cam00_mask.mp4, .*) is not read.*alpha channel"):
+        require_all(read(images))
 
 
 @pytest.mark.parametrize("names", ["Camera Camera.001 Camera.002", "cam cam2", "cam_left cam_top2"])
@@ -270,7 +302,8 @@ def test_images_of_other_kinds_beside_frames_are_left_out(images, other):
     for camera in range(CAMERAS):
         for number in range(5, 5 + FRAMES):
             save(images / f"cam{camera:02d}" / other.format(number), rgb(camera)[0] // 2)
-    with told("no frames beside 5."):
+    mask = "cam00/10_mask.png, .* is not read.*alpha channel of the cameras' images"
+    with told(mask if "mask" in other else "no frames beside 5."):
         found = read(images)
     require_rays_of(found.splits["test"], list(range(FRAMES)))
     if not other.endswith("jpg"):  # Of two formats, either may stay.
@@ -284,8 +317,12 @@ def test_captures_tell_of_videos_that_are_not_read(copied):
     (copied / "poses_bounds.npy").unlink()
     with_transforms(copied, "images/GX{:02d}.png")
     assert not MultiCameraSettings.recognises(copied)
-    with told("GX00.mp4, GX01.mp4, .* 4 videos are not read.*data=multicamera"):
-        settings(NerfstudioSettings, "nerfstudio", copied).load(["train"])
+    read_images = partial(settings(NerfstudioSettings, "nerfstudio", copied).load, ["train"])
+    with told("GX00.mp4, GX01.mp4, .* 4 videos .* Each image has the name of one: .*multicamera"):
+        read_images()
+    (copied / "GX03.mp4").rename(copied / "other.mp4")
+    with told("videos are not read.*If they are of several fixed cameras: .*data=multicamera"):
+        read_images()
 
 
 def test_frames_have_the_number_that_varies(images):
@@ -299,11 +336,55 @@ def test_frames_have_the_number_that_varies(images):
     assert len(found.splits["test"]) == FRAMES - 2
 
 
-def test_cameras_without_simultaneous_frames_are_refused(images):
+def stamp(images: Path, name: Callable[[int, int], str]) -> None:
+    """Rename each camera's frames by its number and theirs."""
     for camera in range(CAMERAS):
-        for place, path in enumerate(sorted((images / f"cam{camera:02d}").iterdir())):
-            path.rename(path.with_name(f"{1700000000000 + 40 * place + camera}.png"))
-    refuse(images, r"no number is in the names of images of all cameras \(cam00/1700000000000.png")
+        found = sorted((images / f"cam{camera:02d}").iterdir(), key=lambda path: int(path.stem))
+        for number, path in enumerate(found):
+            path.rename(path.with_name(f"{name(camera, number)}.png"))
+
+
+STAMPS = {
+    "milliseconds": (lambda camera, number: f"{1700000000000 + 40 * number + camera}", "3", "40"),
+    "nanoseconds": (
+        lambda camera, number: f"rgb_{1700000000000000000 + 40000000 * number + 1000003 * camera}",
+        *(r"3e\+06", r"4e\+07"),
+    ),
+    "seconds": (
+        lambda camera, number: f"{1699999999.9 + number / 30 + camera / 500:.6f}",
+        *("0.006", "0.0333"),
+    ),
+    "dates": (
+        lambda camera, number: f"PXL_20260102_1159{58900 + 40 * number + camera:05d}",
+        *("0.003", "0.04"),
+    ),
+}
+
+
+@pytest.mark.parametrize("gone", [False, True])
+@pytest.mark.parametrize("kind", STAMPS)
+def test_images_of_nearly_equal_times_are_simultaneous(images, kind, gone):
+    name, apart, step = STAMPS[kind]
+    stamp(images, name)
+    words = rf"scene: images of the nearest .* by up to {apart}, .* of one camera by {step}\."
+    if gone:
+        (images / f"cam02/{name(2, 3)}.png").unlink()
+        words += rf"|cam00/{name(0, 3)}.* \(cam02: 5; cam00, cam01, cam03: 6\). 3 images are left"
+    with told(words):
+        found = read(images)
+    if not gone:
+        require_all(found)
+    times = [number / 5 for number in range(FRAMES) if not gone or number != 3]
+    for views in found.splits.values():
+        assert sorted({*views.times.tolist()}) == pytest.approx(times, abs=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["between", "shifted"])
+def test_cameras_without_simultaneous_frames_are_refused(images, kind):
+    late = 20 if kind == "between" else 14
+    stamp(images, lambda camera, number: f"{1700000000000 + 40 * number + late * camera}")
+    words = r"no number .* all cameras \(cam00/1700000000000.png.* differ by less than 0\.3 of the"
+    refuse(images, words)
 
 
 def test_folders_of_single_views_are_no_cameras(tmp_path):
@@ -354,6 +435,7 @@ def test_cameras_that_colmap_registered_may_lie_in_one_folder(images):
     write_colmap(images / "sparse" / "0", lens, [(name, POSES[0], 1, 3) for name in names])
     assert ColmapSettings.recognises(images)
     assert not MultiCameraSettings.recognises(images)
+    refuse(images, r"several images of each camera, such as cam00/0\.png.* with data=colmap")
 
 
 def test_images_of_cameras_as_4dgaussians_counts_them(images):
@@ -480,11 +562,10 @@ def test_settings_of_the_command_line(videos):
         refuse(videos, words, error=MissingSplitError, **options)
 
 
-def test_cameras_of_different_lengths_and_rates(copied, caplog):
+def test_cameras_of_different_lengths_and_rates(copied):
     write_video(copied / "cam02.mp4", rgb(2)[:4])
-    with caplog.at_level(logging.WARNING):
+    with told(r"different .* \(cam02: 4; cam00, cam01, cam03: 6\). The first 4 .*trim"):
         train = read(copied).splits["train"]
-    assert "camera cam02 has 4 frames, but cam00 6: the first 4 frames" in caplog.text
     assert len(train) == 3 * 4
     assert train.times[:4].tolist() == pytest.approx([0, 1 / 3, 2 / 3, 1])
     words = r"cam02\.mp4 has 4 frames.*data\.frames=\[0,3,1\]"
@@ -527,12 +608,13 @@ def test_frames_that_all_cameras_lack_are_a_gap_in_time(images):
     few = read(images, frames=[3, 5, 2])
     assert few.splits["train"].times[:2].tolist() == [0, 1]
     assert few.notes["times"] == "the numbers in their names, from 8 to 50"
-    for camera in range(CAMERAS):  # Across a minute, times of day are no numbers of frames.
+    for camera in range(CAMERAS):  # Times of day are no numbers of frames, as minutes end.
         for path in (images / f"cam{camera:02d}").iterdir():
-            second = f"{int(path.stem) % 50:04d}"
-            path.rename(path.with_name(f"IMG_20260102_11{second}.png"))
+            second = int(path.stem) - 5 + 58
+            clock = f"11{second // 60:02d}{second % 60:02d}"
+            path.rename(path.with_name(f"IMG_20260102_{clock}.png"))
     times = read(images).splits["train"].times
-    assert times[:FRAMES].tolist() == pytest.approx(torch.linspace(0, 1, FRAMES).tolist())
+    assert times[:FRAMES].tolist() == pytest.approx(shares)
 
 
 def test_keys_of_transforms_mean_what_they_mean_to_nerfstudio(images):
@@ -556,11 +638,30 @@ def test_keys_of_transforms_mean_what_they_mean_to_nerfstudio(images):
         up(white_transparent=True, colour="sRGB", orientation_override="none")
 
 
+@pytest.mark.parametrize("key", ["time", "timestamp", "timestep_index"])
+def test_times_of_transforms_are_told_of(images, key):
+    (images / "poses_bounds.npy").unlink()
+    with_transforms(images, "cam{:02d}/5.png")
+    path = images / "transforms.json"
+    content = json.loads(path.read_text())
+    content["frames"] += [
+        frame | {"file_path": frame["file_path"].replace("5.png", "6.png"), key: 3}
+        for frame in content["frames"]
+    ]
+    path.write_text(json.dumps(content))
+    with told(f"not read are '{key}'.*data=nerfstudio reads times"):
+        require_all(read(images))
+
+
 def test_images_that_are_missing_beside_videos(images):
     write_video(images / "cam03.mp4", rgb(3))
     shutil.rmtree(images / "cam03")
     (images / "cam02" / "7.png").unlink()
-    refuse(images, r"numbers of cam00/7\.png, cam01/7\.png\. Add what is")
+    refuse(images, r"numbers of cam00/7\.png, cam01/7\.png \(cam02: 5; .*: 6\)\. Add what is")
+    for camera in range(CAMERAS - 2):
+        (images / f"cam{camera:02d}" / "7.png").unlink()
+    with told(r"cam0\d: numbers are missing between 6.png and 8.png.*Add|different .*cam03: 6\)"):
+        assert len(read(images).splits["test"]) == 5
 
 
 def test_damaged_and_missing_videos_are_named(copied):

@@ -38,7 +38,12 @@ from xplanes.scenes.name_times import times_in_names
         ("a_1_4k a_2_4k a_5_4k", [0, 0.25, 1]),
         ("clip_1_1080p clip_2_1080p clip_5_1080p", [0, 0.25, 1]),
         ("12345678_200001 12345678_200002 12345678_200005", [0, 0.25, 1]),
-        ("cam1 cam2 cam5", [0, 0.25, 1]),
+        ("C0001 C0002 C0005", [0, 0.25, 1]),
+        (
+            " ".join(f"{time:04d}_{camera:02d}" for time in (0, 1, 2, 4) for camera in range(3)),
+            [time / 4 for time in (0, 1, 2, 4) for _ in range(3)],
+        ),
+        ("left_001 left_002 left_005 right_001 right_002 right_005", [0, 0.25, 1] * 2),
         ("20260102_115959 20260102_115959(1) 20260102_115959(3)", [0, 0.5, 1]),
         ("f_000 f_001 f_001(7) f_004", [0, 0.25, 0.25, 1]),
         ("take2_0001 take2_0002 take_0003 take_0005", [0, 0.25, 0.5, 1]),
@@ -68,7 +73,8 @@ def test_names_tell_times(names, times):
     ("names", "words"),
     [
         (["00_58.png", "00_59.png", "01_00.png", "01_01.png", "01_02.png"], r"01_00\.png -> 0\)"),
-        ([f"a_{i // 4}_{'xy'[i % 2]}{'pq'[i % 4 // 2]}.png" for i in range(16)], "only 4, for 16"),
+        ([f"a_{i // 4}_{'abcdefgh'[i % 8]}.png" for i in range(16)], "only 4, for 16"),
+        ([f"camera_{i:04d}.png" for i in range(4)], r"may be those of cameras(.|\n)*static=true"),
         ([f"{i:06d}/{j:02d}.png" for i in range(4) for j in range(2)], "taken for cameras"),
         ([f"{i:06d}/{j:02d}.png" for i in range(4) for j in range(9)], "taken for cameras"),
         ([f"frame{i:05d}/{j:02d}.png" for i in range(4) for j in range(2)], "taken for cameras"),
@@ -87,6 +93,10 @@ def test_times_that_are_hardly_those_of_the_images_are_shown(names, words):
         ("left right", "have no number, such as left"),
         ("3f2a9c b07d1e 9e4410 c5a8f2 77e0b3 0d1f6a", "differ in more than their numbers"),
         ("a_1 b_1", "all 2 images, such as a_1.png, give one number"),
+        ("cam1 cam2 cam5", "numbers in the names .* such as cam1.png, are those of cameras"),
+        ("view_000 view_001 view_002", "are those of cameras"),
+        ("34_Camera01 34_Camera02 34_Camera03", "are those of cameras"),
+        ("c01 c02 c03", "are those of cameras"),
     ],
 )
 def test_names_without_an_order_are_one_timestep(names, words):

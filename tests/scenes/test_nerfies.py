@@ -76,9 +76,10 @@ def test_the_smallest_images_that_are_large_enough(capture):
     middle = corners.view(15, 2, 20, 2, 3).mean(dim=(1, 3))
     found = half.image_rays(0)[1].view(15, 20, 3)
     assert (middle / middle.norm(dim=-1, keepdim=True) - found).abs().max() < 2e-4
-    refused(capture, "41", resolution=41)
-    shutil.rmtree(capture.path / "rgb/1x")
-    refused(capture, "resolution", resolution=40)
+    for resolution, width in ((41, WIDTH), (40, WIDTH // 2)):
+        with told(f"data.resolution={resolution} is more .* Set at most {width}"):
+            assert read(capture, "train", resolution=resolution).splits["train"].width == width
+        shutil.rmtree(capture.path / "rgb/1x", ignore_errors=True)
 
 
 def test_both_names_of_tangential_distortion(capture):

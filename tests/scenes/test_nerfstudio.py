@@ -179,6 +179,12 @@ def test_times_in_any_unit_are_mapped_over_all_frames(capture, caplog, key, firs
         assert views.times.tolist() == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.parametrize("zone", ["Z", "", "+02:00"])
+def test_dates_are_times(capture, zone):
+    capture.timed([f"2026-01-02T11:59:{50 + number * 0.25:05.2f}0{zone}" for number in range(10)])
+    assert capture.all().times.tolist() == pytest.approx([number / 9 for number in range(10)])
+
+
 def test_times_from_0_to_1_stay(capture, caplog):
     capture.timed([0.1 + i / 20 for i in range(10)])
     with caplog.at_level(logging.INFO, logger="xplanes"):
@@ -714,6 +720,21 @@ def test_images_elsewhere_or_one_folder_deeper(capture):
     assert capture.train().files == tuple(f"images/{file}" for file in expected)
 
 
+@pytest.mark.parametrize("name", ["", None])
+def test_frames_without_a_name_are_left_out(capture, name):
+    capture.change(3, file_path=name)
+    with told(f"1 of 10 frames are left out:\n.*frame 3 .*file_path is {name!r}"):
+        assert len(capture.all()) == 9
+
+
+def test_names_that_leave_the_folder_do_not_stand_for_images_inside(capture):
+    capture.change_each(file_path=lambda name: f"../{name}")
+    assert len(capture.all()) == 10
+    for index in range(10):
+        save(capture.path.parent / f"images/frame_{index:05d}.png", disc())
+    capture.refused("leaves the scene's folder")
+
+
 def test_a_percent_encoded_name_is_read(capture):
     (capture.path / "images").rename(capture.path / "my images")
     capture.change_each(file_path=lambda name: name.replace("images", "my%20images"))
@@ -734,8 +755,10 @@ def test_a_percent_encoded_name_is_read(capture):
         lambda name: f"../ball/{name}",
         lambda name: f"./ball/{name}",
         lambda name: name.replace("images", "input"),
+        lambda name: f"./../{name}",
+        lambda name: f"../../{name.removesuffix('.png')}",
     ],
-    ids=["bare", "capitals", "other é", "another machine", "beside", "from above", "renamed"],
+    ids="bare capitals é machine beside above renamed below lower".split(),
 )
 def test_images_are_found_by_names_that_are_nearly_theirs(capture, new):
     for index in range(10):

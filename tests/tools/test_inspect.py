@@ -483,7 +483,7 @@ def test_errors_are_one_line_and_leave_1(tmp_path, monkeypatch, capsys):
         (["ball", "--out", "ball/a.png"], "the scene's own folder"),
         (["ball", "--out", "a.jpg"], "must end in .png"),
         (["ball", "data.resolutoin=3"], "data.resolution"),
-        (["ball", "data.resolution=64"], "data.resolution=64"),
+        (["ball", "data.views=64"], "data.views=64"),
         (["ball", "data=blender"], "transforms_train"),
         (["away"], "negate the second and third column"),
     ]

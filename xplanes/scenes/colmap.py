@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import ClassVar
 
-from xplanes.errors import ConfigError, MissingSplitError, SceneError
+from xplanes.errors import ConfigError, MissingSplitError, SceneError, warn
 from xplanes.files import natural
 from xplanes.scenes.colmap_model import (
     MODELS,
@@ -80,7 +80,7 @@ class ColmapSettings(CaptureSettings):
             return True
         # A transforms.json that was converted from the model takes precedence.
         others = any(folder.glob("transforms*.json")) or (folder / "dataset.json").is_file()
-        return not others and len(models_inside(folder)) == 1
+        return not others and bool(find_model(folder) or len(models_inside(folder)) == 1)
 
     def check(self) -> None:
         super().check()
@@ -256,11 +256,10 @@ def _largest(first: Path) -> Path:
         return first
     counts = {path: image_count(path) for path in (first, *others)}
     largest = max(counts, key=lambda path: counts[path])
-    logger.warning(
-        "%s holds %d models, because COLMAP could not join them all. %s is read, which has the "
-        "most images (%s). Choose another with data.model",
-        *(first.parent, len(counts), largest),
-        ", ".join(f"{path.name} has {count}" for path, count in counts.items()),
+    each = ", ".join(f"{path.name} has {count}" for path, count in counts.items())
+    warn(
+        f"{first.parent} holds {len(counts)} models, because COLMAP could not join them all. "
+        f"{largest} is read, which has the most images ({each}). Choose another with data.model."
     )
     return largest
 

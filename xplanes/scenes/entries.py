@@ -9,7 +9,7 @@ import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
-from pathlib import Path, PureWindowsPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, TypeGuard, TypeVar
 from urllib.parse import unquote
 
@@ -175,7 +175,8 @@ def spelt(name: Any) -> str:
 def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) -> Iterator[Path]:
     """Paths that a name may refer to inside ``folder``, unchanged and with image suffixes.
 
-    Links are followed, even out of the folder; ``..`` must not leave it.
+    Links are followed, even out of the folder; ``..`` must not leave it, unless nothing is there
+    and the rest of the name leads to a file inside.
 
     Args:
         label: The file and frame that name it, for messages.
@@ -185,20 +186,26 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
         example: A valid name, for messages.
 
     Raises:
+        BrokenFrameError: If it is empty or null.
         SceneError: If it is not a name, or leaves the folder.
     """
     if not isinstance(name, str) or not name or "\0" in name:
-        raise SceneError(f"{label}: {key} is {short(name)}; it must be text such as {example}.")
+        problem = BrokenFrameError if name in ("", None) else SceneError
+        raise problem(f"{label}: {key} is {short(name)}; it must be text such as {example}.")
     # Blender on Windows writes backslashes.
     whole = Path(os.path.normpath(folder / spelt(name)))
     parts = whole.parts
     if whole.is_relative_to(folder):
         parts = whole.relative_to(folder).parts
     elif not PureWindowsPath(name).anchor:
-        raise SceneError(
-            f"{label}: {key} leaves the scene's folder {folder} (it is {name}). Put its files "
-            f"inside the folder and correct {key}."
-        )
+        # The file of the cameras may have been moved up, out of a folder beside the images.
+        inner = PurePosixPath(spelt(name).replace("../", ""))
+        if whole.exists() or not any((folder / f"{inner}{suffix}").exists() for suffix in SUFFIXES):
+            raise SceneError(
+                f"{label}: {key} leaves the scene's folder {folder} (it is {name}). Put its files "
+                f"inside the folder and correct {key}."
+            )
+        name, parts = inner.as_posix(), inner.parts
     # If the path does not exist, its first folders are dropped one by one. That of a split tells
     # apart files such as train/0001.png and test/0001.png, and so does a folder that exists.
     last, own = len(parts), parts[:-1]

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from xplanes.errors import SceneError, all_of
+from xplanes.errors import SceneError, all_of, warn
 from xplanes.scenes import store
 from xplanes.scenes.formats import SIXTEEN_BIT_MODES, open_image, read_header
 from xplanes.scenes.masks import MaskKind, read_mask
@@ -65,7 +65,7 @@ def load_images(paths: Sequence[Path], resolution: int | None) -> Tensor:
         Colour, premultiplied by alpha before it is averaged, and alpha. uint8 [V, H, W, 4]
 
     Raises:
-        SceneError: If a file cannot be decoded, sizes differ, or the resolution cannot be met.
+        SceneError: If a file cannot be decoded, or sizes differ.
     """
     advice = "All images must have one size: export or resize them alike."
     size = shared_size(paths, str(paths[0]), advice)
@@ -118,24 +118,26 @@ def final_sizes(
 ) -> list[Size]:
     """Heights and widths of images that are reduced to one width, with their own aspect ratios.
 
+    Narrower images keep their size, with a warning, as enlarged ones have no more detail.
+
     Args:
         paths: Image files. [V]
         native: Their sizes. [V]
         resolution: Width in pixels; None keeps the sizes.
-
-    Raises:
-        SceneError: If an image is narrower than ``resolution``.
     """
     if resolution is None:
         return list(native)
-    width, path = min((size[1], path) for path, size in zip(paths, native, strict=True))
-    if resolution > width:
-        raise SceneError(
-            f"data.resolution={resolution} is more than the {width} pixels that {path} is wide. "
-            f"Enlarged images have no more detail: set at most {width}, or null for the native "
-            "size."
+    narrow = [(width, path) for path, (_, width) in zip(paths, native, strict=True)]
+    narrow = [(width, path) for width, path in narrow if width < resolution]
+    if narrow:
+        width, path = min(narrow)
+        warn(
+            f"data.resolution={resolution} is more than the width of {len(narrow)} of {len(paths)} "
+            f"images or cameras, which keep their size: {path} is {width} pixels wide. Set at most "
+            f"{width} for equal widths, or null for the native size."
         )
-    return [(max(1, round(height * resolution / width)), resolution) for height, width in native]
+    kept = [(height, width, min(width, resolution)) for height, width in native]
+    return [(max(1, round(height * less / width)), less) for height, width, less in kept]
 
 
 def read_images(

@@ -1,6 +1,7 @@
 """Mask files: the meaning of their values and black parts, determined for a whole capture."""
 
 import logging
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,9 @@ MaskUse = Literal["auto", "alpha", "ignore", "lrm"]
 alpha: empty space; ignore: pixels to ignore; lrm: removed only from the LRM's input; auto: empty
 space if masks look like silhouettes, else pixels to ignore.
 """
+
+MASKS = re.compile(r"(?i)mask|(?<![a-z])mattes?(?![a-z])|silhouette")
+"""Part of the names of masks."""
 
 SURVEYED = 32
 """Number of masks that are sampled to determine the meaning of a capture's masks."""

@@ -2,6 +2,7 @@
 
 import logging
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,17 +28,18 @@ from xplanes.scenes.images import (
     shrink,
 )
 from xplanes.scenes.listing import final_intrinsics, misshapen
-from xplanes.scenes.name_times import DATE, most_different
+from xplanes.scenes.name_times import DATE, Number, most_different, times_of_clocks
 from xplanes.scenes.rigs import (
     POSES,
     Camera,
     are_registered,
     frames_in,
+    is_calibrated,
     is_rig,
     read_cameras,
-    recordings_below,
+    recordings_of_rows,
 )
-from xplanes.scenes.source import SceneSettings
+from xplanes.scenes.source import SceneSettings, warn_of_masks
 from xplanes.scenes.transforms import stated_up
 from xplanes.scenes.views import Scene, Views
 
@@ -45,6 +47,9 @@ logger = logging.getLogger(__name__)
 
 MOST_DRIFT = 0.5
 """Largest drift between synchronised cameras until the shortest of them ends, in frames."""
+
+NEAR = 0.3
+"""A larger difference between times of images, in intervals, is one between timesteps."""
 
 LATE = 1.5
 """A longer gap between frames, relative to the median gap, indicates a variable frame rate."""
@@ -55,8 +60,8 @@ class MultiCameraSettings(SceneSettings):
     """Synchronised videos of several fixed cameras."""
 
     files: ClassVar = (
-        "videos or folders cam00, cam01, ... with poses_bounds.npy, a model of COLMAP, or a "
-        "transforms.json with a frame of each"
+        "videos or folders cam00, cam01, ... with poses_bounds.npy, a model of COLMAP, a "
+        "transforms.json with a frame of each, or EasyMocap's extri.yml"
     )
 
     frames: list[int] | None  # First frame, last frame and stride; null for all frames.
@@ -85,8 +90,8 @@ class MultiCameraSettings(SceneSettings):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         if (folder / POSES).is_file():
-            return bool(recordings_below(folder))
-        return is_rig(folder) or are_registered(folder)
+            return bool(recordings_of_rows(folder))
+        return is_rig(folder) or are_registered(folder) or is_calibrated(folder)
 
     def load(self, splits: Sequence[str]) -> Scene:
         if self.train_on_video:
@@ -107,6 +112,8 @@ class MultiCameraSettings(SceneSettings):
                 )
         watched = _video_camera(cameras, parts, self.video_camera)
         recordings = _simultaneous([_recording(camera) for camera in cameras])
+        seen = [(recording.images or [recording.camera.source])[0] for recording in recordings]
+        warn_of_masks(folder, seen, "put them into the alpha channel of the cameras' images")
         poses = torch.from_numpy(np.stack([camera.pose for camera in cameras]))
         poses[:, :3, 3] -= torch.from_numpy(origin_near(folder, poses[:, :3, 3].numpy()))
         images = [image for recording in recordings for image in recording.images[:1]]
@@ -266,54 +273,126 @@ def _are_stamped(recordings: Sequence[Recording]) -> bool:
 def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
     """The recordings, without images of timesteps that some cameras lack; warns about these images.
 
-    Images of equal numbers are simultaneous. If the cameras' numbers do not overlap, they are
-    counted from the first of each camera. They become the images' times, as all cameras may lack
-    the same ones.
+    Images of equal numbers are simultaneous, or of the nearest ones, as clocks of cameras differ.
+    If the cameras' numbers do not overlap, they are counted from the first of each camera. Those of
+    the first camera become the images' times, as all cameras may lack the same ones.
 
     Raises:
         SceneError: If images are missing, and other cameras have videos.
     """
-    numbers: dict[int, list[int]] = {}
-    for camera, recording in enumerate(recordings):
-        stems = [path.stem for path in recording.images]
-        if stems and (found := most_different(stems)):
-            numbers[camera] = [int(number) for number in found]
+    numbers = {
+        camera: found
+        for camera, recording in enumerate(recordings)
+        if recording.images and (found := _numbers(recording.images))
+    }
     each = list(numbers.values())
     if not each or any(len({*own}) < len(own) for own in each):
         return list(recordings)
     if max(own[0] for own in each) > min(own[-1] for own in each):
         numbers = {camera: [n - own[0] for n in own] for camera, own in numbers.items()}
-    common = set.intersection(*map(set, numbers.values()))
+    folder = recordings[0].camera.source.parent
+    partners, apart, step = _partners(list(numbers.values()))
+    common = np.flatnonzero((partners >= 0).all(axis=0)).tolist()
     if not common:
         pairs = [(camera, recordings[camera].images[0]) for camera in numbers]
         shown = some([f"{recordings[camera].camera.name}/{path.name}" for camera, path in pairs])
         raise SceneError(
-            f"{recordings[0].camera.source.parent}: no number is in the names of images of all "
-            f"cameras ({shown}), so that none are simultaneous. Number simultaneous images alike."
+            f"{folder}: no number is in the names of images of all cameras ({shown}), nor do the "
+            f"nearest differ by less than {NEAR:g} of the interval between images, so that none "
+            "are simultaneous. Number simultaneous images alike."
         )
+    chosen = [
+        tuple(recordings[camera].images[place] for place in found[common])
+        for camera, found in zip(numbers, partners, strict=True)
+    ]
     lost = {
         f"{recordings[camera].camera.name}/{path.name}"
-        for camera, own in numbers.items()
-        for number, path in zip(own, recordings[camera].images, strict=True)
-        if number not in common
+        for camera, kept in zip(numbers, chosen, strict=True)
+        for path in {*recordings[camera].images} - {*kept}
     }
     if lost:
         text = (
-            f"{recordings[0].camera.source.parent}: frames must be simultaneous, but not all "
-            f"cameras have an image of the numbers of {some(sorted(lost, key=natural))}"
+            f"{folder}: frames must be simultaneous, but not all cameras have an image of the "
+            f"numbers of {some(sorted(lost, key=natural))}{_counts(recordings)}"
         )
         if len(numbers) < len(recordings):
             raise SceneError(f"{text}. Add what is missing, or extract the images of all videos.")
         warn(f"{text}. {len(lost)} images are left out.")
+    if apart:
+        warn(
+            f"{folder}: images of the nearest numbers are taken to be simultaneous, as those of "
+            f"different cameras differ by up to {apart:.3g}, and those of one camera by "
+            f"{step:.3g}. If they are not simultaneous, number those alike that are."
+        )
     if len(numbers) < len(recordings):
+        for camera, own in numbers.items():
+            _warn_of_gaps(recordings[camera], own)
         return list(recordings)
-    chosen = []
-    for camera, own in numbers.items():
-        kept = [place for place, number in enumerate(own) if number in common]
-        images = tuple(recordings[camera].images[place] for place in kept)
-        times = tuple(own[place] for place in kept) if _are_series(images) else ()
-        chosen.append(replace(recordings[camera], count=len(kept), images=images, times=times))
-    return chosen
+    shared = tuple(next(iter(numbers.values()))[place] for place in common)
+    timed = isinstance(shared[0], float)  # Of clocks.
+    times = [shared if timed or _are_series(images) else () for images in chosen]
+    return [
+        replace(recording, count=len(common), images=images, times=own)
+        for recording, images, own in zip(recordings, chosen, times, strict=True)
+    ]
+
+
+def _numbers(images: Sequence[Path]) -> list[Number]:
+    """Times of clocks in the images' names, as floats, if they differ; else whole numbers."""
+    times = times_of_clocks([path.name for path in images])
+    return times if len({*times}) == len(images) else most_different([p.stem for p in images])
+
+
+def _counts(recordings: Sequence[Recording]) -> str:
+    """The cameras by their numbers of frames, in brackets; empty if all have the same."""
+    cameras: dict[int, list[str]] = defaultdict(list)
+    for recording in recordings:
+        cameras[recording.count].append(recording.camera.name)
+    each = "; ".join(f"{some(names)}: {count}" for count, names in sorted(cameras.items()))
+    return f" ({each})" if len(cameras) > 1 else ""
+
+
+def _partners(each: Sequence[Sequence[Number]]) -> tuple[np.ndarray, float, float]:
+    """The images of each camera that are simultaneous with those of the first.
+
+    Args:
+        each: Numbers of each camera's images. [C]
+
+    Returns:
+        Indices of the images, -1 if there is none, int64 [C, N]; the largest difference between
+        their numbers; and the shortest of the cameras' median intervals.
+    """
+    # Subtracted before conversion to float, which cannot represent clocks in nanoseconds exactly.
+    series = [np.array([number - each[0][0] for number in own], dtype=np.float64) for own in each]
+    step = min(float(np.median(np.diff(np.sort(own)))) if len(own) > 1 else 1.0 for own in series)
+    first, found, apart = series[0], [], 0.0
+    for own in series:
+        places = _nearest(own, first)
+        gaps = np.abs(own[places] - first)
+        kept = (gaps < NEAR * step) & (_nearest(first, own[places]) == np.arange(len(first)))
+        found.append(np.where(kept, places, -1))
+        apart = max(apart, *gaps[kept].tolist(), 0.0)
+    return np.stack(found), apart, step
+
+
+def _nearest(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Index of the value that is nearest to each wanted one. [N]"""
+    order = values.argsort()
+    above = np.searchsorted(values, wanted, sorter=order)
+    pair = np.stack([order[(above - 1).clip(0)], order[above.clip(max=len(values) - 1)]])
+    return pair[np.abs(values[pair] - wanted).argmin(axis=0), np.arange(len(wanted))]
+
+
+def _warn_of_gaps(recording: Recording, numbers: Sequence[Number]) -> None:
+    """Warn about missing images of a camera beside others with videos."""
+    steps = np.diff(np.array([number - numbers[0] for number in numbers], dtype=np.float64))
+    if len(steps) and steps.max() > LATE * np.median(steps):
+        before, after = recording.images[steps.argmax() :][:2]
+        warn(
+            f"{recording.camera.source}: numbers are missing between {before.name} and "
+            f"{after.name}, but as other cameras have videos, images are taken for their frames in "
+            "order. Add what is missing, or extract the images of all videos."
+        )
 
 
 def _are_series(images: Sequence[Path]) -> bool:
@@ -341,10 +420,10 @@ def _frame_numbers(
     if stamped:
         return [range(recording.count) for recording in recordings]
     if shortest.count < longest.count:
-        logger.warning(
-            "%s: camera %s has %d frames, but %s %d: the first %d frames of every camera are used",
-            *(folder, shortest.camera.name, shortest.count, longest.camera.name, longest.count),
-            shortest.count,
+        warn(
+            f"{folder}: cameras have different numbers of frames{_counts(recordings)}. The first "
+            f"{shortest.count} of every camera are used, as if they were simultaneous. If they are "
+            "not, trim the recordings to a common start."
         )
     return [range(shortest.count)] * len(recordings)
 

@@ -1,5 +1,6 @@
 """Times of images from the numbers in their names."""
 
+import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Sequence
@@ -25,6 +26,12 @@ CAMERA = re.compile(
     r"|(?<![^_\-. ])[cv]\d+(?=$|[_\-. ])"
 )
 """The number of a camera, as in 034_cam1."""
+
+CLIP = re.compile(r"(?i)[cv]\d{3,}")
+"""The number of a clip or a frame rather than of a camera."""
+
+MOST_DIGITS = 3
+"""Digits of a camera's number; longer ones may be those of frames, as in cam_0001."""
 
 CLOCK = re.compile(r"(?<![A-Za-z\d])\d+\.\d+(?=s?$)|(?<!\d)(\d{10})[_-](\d{9}|\d{6}|\d{3})$")
 """Seconds and their fraction at the end of a name, as in 1305031102.175304."""
@@ -55,16 +62,14 @@ def times_in_names(names: Sequence[str]) -> list[Number]:
 
     Times are dates with the time of day, seconds with a fraction, or else the number that varies
     most among the names and is not that of a camera. Warns, with examples, if times are not in the
-    order of the names, or if there are far fewer times than images.
+    order of the names, may be numbers of cameras, or if there are far fewer times than images.
 
     Args:
         names: Names of the images, with their folders. [V]
     """
+    if times := times_of_clocks(names):
+        return _checked(names, times)
     stems = [PurePosixPath(name).stem for name in names]
-    for times in (_dates(stems), [_clock(stem) for stem in stems]):
-        found = [time for time in times if time is not None]
-        if len(found) == len(names) and not _few(names, found):
-            return _checked(names, found)
     # If each folder is a timestep, file names are those of cameras.
     paths = [PurePosixPath(name).with_suffix("").as_posix() for name in names]
     files, whole = ([CAMERA.sub("", text) for text in texts] for texts in (stems, paths))
@@ -72,10 +77,32 @@ def times_in_names(names: Sequence[str]) -> list[Number]:
         found = most_different(texts)
         if len(set(found)) > 1 or (found and len(names) == 1):
             break
-    if why := _no_series(names, stems, found):
+    digits = _digits_of_cameras(stems) if texts is stems and len(names) > 1 else 0
+    why = _no_series(names, stems, found)
+    if not why and 0 < digits <= MOST_DIGITS:
+        why = f"The numbers in the names of the images, such as {names[0]}, are those of cameras"
+    if why:
         warn(f"{why}: all images are taken for one timestep. {OTHER_TIMES}")
         return []
-    return _checked(names, found, by_file=texts is not whole)
+    return _checked(names, found, by_file=texts is not whole, by_camera=digits > MOST_DIGITS)
+
+
+def times_of_clocks(names: Sequence[str]) -> list[Number]:
+    """Dates with the time of day, or seconds with a fraction; empty if a name has none."""
+    stems = [PurePosixPath(name).stem for name in names]
+    for times in (_dates(stems), [_clock(stem) for stem in stems]):
+        found: list[Number] = [time for time in times if time is not None]
+        if len(found) == len(names) and not _few(names, found):
+            return found
+    return []
+
+
+def _digits_of_cameras(stems: Sequence[str]) -> int:
+    """The most digits of a camera's number in names; 0 if a name has none."""
+    found = [match[0] if (match := CAMERA.search(stem)) else "" for stem in stems]
+    if not all(found) or any(map(CLIP.fullmatch, found)):
+        return 0
+    return max(len(re.sub(r"\D", "", text)) for text in found)
 
 
 def _dates(stems: Sequence[str]) -> list[float | None]:
@@ -152,33 +179,53 @@ def _no_series(names: Sequence[str], stems: Sequence[str], found: Sequence[Numbe
     return None
 
 
-def _folders(names: Sequence[str]) -> list[list[int]]:
+def _is_grid(names: Sequence[str], times: Sequence[Number]) -> bool:
+    """Whether names differ in their time and in another part, a camera, with all pairs of both."""
+    rest = []
+    for name, time in zip(names, times, strict=True):
+        others = [int(number) for number in re.findall(NUMBER, name)]
+        if time in others:
+            others.remove(int(time))
+        rest.append((re.sub(r"\d+", "#", name), *sorted(others)))
+    pairs, counts = {*zip(rest, times, strict=True)}, (len({*rest}), len({*times}))
+    return min(counts) > 1 and len(pairs) == len(names) == math.prod(counts)
+
+
+def _folders(names: Sequence[str], times: Sequence[Number]) -> list[list[int]]:
     """Indices of the images of each folder and camera, in the order of their names."""
     folders: dict[tuple[str, ...], list[int]] = defaultdict(list)
     paths = [PurePosixPath(name).with_suffix("") for name in names]
+    # Cameras may be called by letters, as in left_0001.
+    kinds = [re.sub(r"\d+", "#", path.name) for path in paths]
+    kinds = kinds if _is_grid(names, times) else [""] * len(names)
     bare = [natural(CAMERA.sub("", path.as_posix())) for path in paths]
     for place in sorted(range(len(names)), key=bare.__getitem__):
         path = paths[place]
         cameras = (match[0] for match in CAMERA.finditer(path.name))
-        folders[path.parent.as_posix(), *cameras].append(place)
+        folders[path.parent.as_posix(), kinds[place], *cameras].append(place)
     return list(folders.values())
 
 
 def _few(names: Sequence[str], times: Sequence[Number]) -> bool:
     """Whether there are far fewer times than images in a folder."""
-    return len(set(times)) < FEW * max(map(len, _folders(names)))
+    if _is_grid(names, times):
+        return False
+    return len(set(times)) < FEW * max(map(len, _folders(names, times)))
 
 
-def _checked(names: Sequence[str], times: list[Number], by_file: bool = False) -> list[Number]:
+def _checked(
+    names: Sequence[str], times: list[Number], by_file: bool = False, by_camera: bool = False
+) -> list[Number]:
     """The times; warns if they are implausible.
 
     Args:
         names: Names of the images. [V]
         times: Their times. [V]
         by_file: Whether the times are numbers in the files' names, even if folders are timesteps.
+        by_camera: Whether they follow the word for a camera.
     """
-    why, shown = "", list(range(min(3, len(names))))
-    for places in _folders(names):
+    why, shown = "may be those of cameras" if by_camera else "", list(range(min(3, len(names))))
+    for places in _folders(names, times):
         back = [pair for pair in pairwise(places) if times[pair[1]] < times[pair[0]]]
         if back:
             why, shown = "do not have the order of the names", [*back[0]]

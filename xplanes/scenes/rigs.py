@@ -1,13 +1,14 @@
 """The cameras of a rig: which videos or folders are theirs, and their calibration.
 
 A calibration is poses_bounds.npy (Neural 3D Video), with rows in the order of the cameras' names; a
-transforms.json that names each camera's video, its folder of images, or one of these images; or a
-model of COLMAP that has registered one image per camera, with the name of the camera.
+transforms.json that names each camera's video, its folder of images, or one of these images; a
+model of COLMAP that has registered one image per camera, with the name of the camera; or a file of
+another program (`calibrations`).
 """
 
 import functools
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -18,11 +19,19 @@ import numpy as np
 from xplanes.errors import SceneError, warn
 from xplanes.files import natural
 from xplanes.scenes import videos
+from xplanes.scenes.calibrations import find_calibration, read_calibrations
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, image_count, read_model
 from xplanes.scenes.entries import checked_pose, is_positive, paths_inside, reading, some
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import Calibration
-from xplanes.scenes.transforms import TRANSPARENT, read_calibration, read_frames, warn_of_unknown
+from xplanes.scenes.masks import MASKS
+from xplanes.scenes.transforms import (
+    TIMES,
+    TRANSPARENT,
+    read_calibration,
+    read_frames,
+    warn_of_unknown,
+)
 
 POSES = "poses_bounds.npy"
 TRANSFORMS = "transforms.json"
@@ -42,11 +51,15 @@ STATIC = "none, as in LLFF's static captures (data.static=false takes those in t
 TIMESTEPS = "mv_images"
 """Folder with a subfolder for each timestep, as in Nvidia's Dynamic Scenes."""
 
-UNREAD = ("mask_path", *TRANSPARENT, "train_filenames", "val_filenames", "test_filenames")
+UNREAD = (
+    *("mask_path", *TRANSPARENT, *TIMES),
+    *("train_filenames", "val_filenames", "test_filenames"),
+)
 """Keys of transforms files that are read of captures, but not of several fixed cameras."""
 
 OTHER_KINDS = re.compile(
-    r"(?i)(?<![a-z])(masks?|mattes?|depths?|disp|seg|segmentations?|normals?|flow)(?![a-z])"
+    r"(?i)(?<![a-z])(masks?|mattes?|silhouettes?|depths?|disp|seg|segmentations?|normals?|flow)"
+    r"(?![a-z])"
 )
 """Part of the names of images that show something else than colours."""
 
@@ -93,12 +106,14 @@ def read_cameras(folder: Path) -> tuple[list[Camera], Mapping[str, Any]]:
         cameras = _from_transforms(folder, content)
     elif (model := find_model(folder)) is not None:
         cameras = _from_colmap(folder, model)
+    elif (path := find_calibration(folder)) is not None:
+        cameras = _from_calibration(folder, path)
     else:
         found = ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "nothing"
         raise SceneError(
             f"{folder} holds neither {POSES} (Neural 3D Video) nor {TRANSFORMS} (a frame for each "
-            f"camera) nor {MODELS[0]} (COLMAP's model of an image of each), but {found}. Add the "
-            "calibration of the cameras."
+            f"camera) nor {MODELS[0]} (COLMAP's model of an image of each) nor extri.yml "
+            f"(EasyMocap), but {found}. Add the calibration of the cameras."
         )
     cameras = _named_apart(cameras)
     names = [camera.name for camera in cameras]
@@ -124,6 +139,7 @@ def _named_apart(cameras: Sequence[Camera]) -> list[Camera]:
 def recordings_of_cameras(folder: Path) -> list[Path]:
     """Videos and folders called cam*, else those with numbers such as 00 or view_01, by name."""
     inside = sorted(filter(_is_recording, folder.iterdir()))
+    inside = [path for path in inside if not OTHER_KINDS.search(camera_name(path))] or inside
     numbered = [path for path in inside if NUMBERED.fullmatch(camera_name(path))]
     named = [path for path in inside if CAMERAS.match(camera_name(path))]
     counted = [path for path in named if re.search(r"\d", camera_name(path))]
@@ -146,14 +162,46 @@ def are_registered(folder: Path) -> bool:
     return len(found) > 1 and 1 < image_count(place) <= len(found)
 
 
+def is_calibrated(folder: Path) -> bool:
+    """Whether another program's calibration is the only one, and names two recordings or more."""
+    path = find_calibration(folder)
+    if path is None or any(folder.glob("transforms*.json")) or find_model(folder):
+        return False
+    text = path.read_text(encoding="utf-8", errors="replace")
+    names = _recordings_of_any_name(folder)
+    return sum(bool(re.search(rf'["_]{re.escape(name)}\b', text)) for name in names) > 1
+
+
+def _recordings_of_any_name(folder: Path) -> dict[str, Path]:
+    """Videos, or else folders of images, in a folder or in one inside, by camera."""
+    inside = [path for path in folder.iterdir() if path.is_dir() and path.name[0] != "."]
+    places = [folder, *(path for path in inside if not OTHER_KINDS.search(path.name))]
+    found = [path for place in places for path in sorted(filter(_is_recording, place.iterdir()))]
+    # EasyMocap extracts images from videos, and programs write folders of the same names.
+    found.sort(key=lambda path: (path.is_file(), path.parent.name.lower() in IMAGES))
+    return {camera_name(path).removeprefix("hd_"): path for path in found if _is_filled(path)}
+
+
 def recordings_below(folder: Path, *others: str) -> list[Path]:
     """Recordings in a folder, or in its only subfolder, but for ``others``, that has some."""
     if found := recordings_of_cameras(folder):
         return found
     others = (TIMESTEPS, *others)
     inside = [path for path in folder.iterdir() if path.is_dir() and path.name not in others]
+    inside = [path for path in inside if not OTHER_KINDS.search(path.name)]
     deeper = [paths for path in inside if (paths := recordings_of_cameras(path))]
+    if len(deeper) > 1:  # Of videos and images extracted from them, videos are read.
+        named = [paths for paths in deeper if paths[0].parent.name.lower() in IMAGES]
+        deeper = [paths for paths in deeper if all(map(Path.is_file, paths))] or named
     return deeper[0] if len(deeper) == 1 else []
+
+
+def recordings_of_rows(folder: Path) -> list[Path]:
+    """Recordings with rows in poses_bounds.npy: of any name if there are only videos."""
+    inside = sorted(path for path in folder.iterdir() if path.name[0] != ".")
+    loose = [path for path in inside if path.suffix.lower() in videos.SUFFIXES]
+    others = len(loose) < 2 or any(path.name.startswith("images") for path in inside)
+    return recordings_below(folder) or ([] if others else loose)
 
 
 def is_rig(folder: Path) -> bool:
@@ -196,7 +244,7 @@ def _from_poses_bounds(folder: Path) -> list[Camera]:
     """Cameras of poses_bounds.npy; its rows are in the order of the videos' or folders' names."""
     path = folder / POSES
     # A video may be beside a folder of images extracted from it.
-    sources = list({camera_name(source): source for source in recordings_below(folder)}.values())
+    sources = list({camera_name(source): source for source in recordings_of_rows(folder)}.values())
     names = [source.name for source in sources]
     if names != sorted(names, key=natural):
         pairs = ", ".join(f"row {row} is {name}" for row, name in enumerate(names[:3]))
@@ -288,6 +336,13 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
     expected = sorted(expected | set(recordings))
     sources |= _counted(model, recordings)
     owned: dict[Path, list[str]] = {path: [] for path in expected}
+    folders = Counter(PurePosixPath(name).parent for name in model.names)
+    if len(folders) > 1 and min(folders.values()) > 1:
+        raise SceneError(
+            f"{model.source} has several images of each camera, such as {some(model.names)}. Read "
+            "them all, at the times in their names, with data=colmap; data=multicamera reads the "
+            "frames of cameras of which one image is registered."
+        )
     cameras, problems = [], []
     for name, pose, calibration in zip(
         model.names, model.camera_to_world, model.calibrations, strict=True
@@ -321,6 +376,27 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
             f"Registered images: {some(model.names)}. Videos, and folders of the name cam*, in "
             f"{folder}: {some([path.name for path in expected]) or 'none'}. Move what is not a "
             "camera elsewhere, or read all registered images with data=colmap."
+        )
+    return cameras
+
+
+def _from_calibration(folder: Path, path: Path) -> list[Camera]:
+    """Those cameras of another program's calibration that have a recording."""
+    sources, cameras, lost = _recordings_of_any_name(folder), [], []
+    for name, label, pose, calibration in read_calibrations(path):
+        if (source := sources.get(name)) is None:
+            lost.append(name)
+        else:
+            cameras.append(Camera(name, source, pose, calibration, label))
+    if not cameras:
+        raise SceneError(
+            f"{path}: none of its cameras has a video or a folder of images of its name, such as "
+            f"images/{lost[0]} or videos/{lost[0]}.mp4. Add them to {folder}."
+        )
+    if lost:
+        warn(
+            f"{path}: {len(lost)} of {len(lost) + len(cameras)} cameras have no video or folder of "
+            f"images of their name and are left out: {some(lost)}."
         )
     return cameras
 
@@ -376,7 +452,7 @@ def _kind(path: Path) -> str:
 
 
 def frames_in(folder: Path) -> list[Path]:
-    """The images of a folder that are a camera's frames; warns of the others.
+    """The images of a folder that are a camera's frames; warns of the others, but for masks.
 
     Left out are masks, depths and the like beside images of another kind, images without a number
     beside those with one, and copies in another format.
@@ -386,7 +462,8 @@ def frames_in(folder: Path) -> list[Path]:
     kept = [path for path in kept if re.search(r"\d", path.stem)] or kept
     kept = list({path.stem: path for path in reversed(kept)}.values())[::-1]
     used = {*kept}
-    if left := [path.name for path in images if path not in used]:
+    left = [path.name for path in images if path not in used and not MASKS.search(path.name)]
+    if left:
         warn(f"{folder}: {some(left)}: no frames beside {kept[0].name}. {len(left)} are left out.")
     return kept
 

@@ -17,7 +17,7 @@ from xplanes.scenes.formats import is_image
 from xplanes.scenes.frame import CubeHints
 from xplanes.scenes.images import GREY
 from xplanes.scenes.listing import Listing, read_views
-from xplanes.scenes.masks import MaskUse, chosen_use, survey
+from xplanes.scenes.masks import MASKS, MaskUse, chosen_use, survey
 from xplanes.scenes.videos import SUFFIXES as VIDEOS
 from xplanes.scenes.views import Scene, Views, joined, spread
 from xplanes.settings import Count, Location, Positive, Settings
@@ -66,42 +66,46 @@ def as_static(scene: Scene, reason: str) -> Scene:
     )
 
 
-def warn_of_masks(folder: Path, images: Sequence[Path]) -> None:
+def warn_of_masks(folder: Path, images: Sequence[Path], advice: str = "") -> None:
     """Warn about files and folders that seem to be masks, but are not read.
 
     Args:
         folder: The scene's folder.
         images: Its images, without masks.
+        advice: What to do with masks; empty if they can be named.
     """
     folder, images = folder.resolve(), [path.resolve() for path in images]
     places = {path.parent for path in images}
     used = {*images, *places}
+    above = {place.parent for place in places if folder in place.parents}
     found = sorted(
         path
-        for place in {folder, *places}
+        for place in {folder, *places, *above}
         for path in place.iterdir()
-        if "mask" in path.name.lower() and path not in used
-        if path.is_dir() or is_image(path)
+        if MASKS.search(path.name) and path not in used
+        if path.is_dir() or is_image(path) or (advice and path.suffix.lower() in VIDEOS)
     )
     if found:
         names = some([path.as_posix().removeprefix(f"{folder.as_posix()}/") for path in found])
         place = found[0] if found[0].is_dir() else found[0].parent
-        warn(
-            f"{folder}: {names} is not read. If these are masks of the images, name their folder "
-            f"(data.masks={place.name}, of colmap and nerfies), or their files (mask_path of "
-            "the frames in transforms files)."
+        advice = advice or (
+            f"name their folder (data.masks={place.name}, of colmap and nerfies), or their files "
+            "(mask_path of the frames in transforms files)"
         )
+        warn(f"{folder}: {names} is not read. If these are masks of the images, {advice}.")
 
 
-def warn_of_videos(folder: Path) -> None:
-    """Warn about several videos in a capture's folder, or in one inside, which are not read."""
+def warn_of_videos(folder: Path, images: Sequence[Path]) -> None:
+    """Warn about several videos in a capture's folder, or in one inside, but for its images."""
     inside = [path for pattern in ("*", "*/*") for path in folder.glob(pattern)]
     inside = [path for path in inside if path.suffix.lower() in VIDEOS and path.name[0] != "."]
     found = sorted(path.name for path in inside)
     if len(found) > 1:
+        alike = {path.stem for path in images} <= {path.stem for path in inside}
+        when = "Each image has the name of one" if alike else "If they are of several fixed cameras"
         warn(
-            f"{folder}: {some(found)}: {len(found)} videos are not read, only images are. If they "
-            "are those of several fixed cameras, read them with data=multicamera."
+            f"{folder}: {some(found)}: {len(found)} videos are not read, only images are. {when}: "
+            "read them with data=multicamera."
         )
 
 
@@ -112,7 +116,8 @@ class SceneSettings(Settings, ABC):
     name: str  # Name of the format in run directories and tables.
     root: Location  # Folder that holds the scenes.
     scene: Location  # Folder of the scene, or name of the demo scene.
-    resolution: Count | None  # Width of the images in pixels; null keeps the native size.
+    # Width of the images in pixels, or theirs if that is less; null keeps the native size.
+    resolution: Count | None
     views: Count | None  # Training views, spread over time; null for all.
     train_on_video: bool  # Also train on the frames of the fixed camera.
     static: bool | None  # Static scene; null: static if the fixed camera's frames are equal.
@@ -375,7 +380,7 @@ class CaptureSettings(SceneSettings, ABC):
                 )
         if not any(listing.masks):
             warn_of_masks(self.folder, listing.paths)
-        warn_of_videos(self.folder)
+        warn_of_videos(self.folder, listing.paths)
         turn, words = world_turn(listing.camera_to_world, listing.paths, self.orient, up)
         found = None if points is None else torch.from_numpy(points - np.array(listing.origin))
         if turn is not None:

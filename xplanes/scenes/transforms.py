@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -406,9 +407,10 @@ def warn_of_unknown(path: Path, content: Mapping[str, Any], unread: Sequence[str
         if _has_content(value) or "color" in key  # Zeros in a colour mean black.
     }
     if unknown := sorted(given - ({*KNOWN, *IGNORED} - {*unread})):
+        other = " data=nerfstudio reads times, masks and splits." if {*unread} & {*unknown} else ""
         warn(
             f"{path}: keys that are not read are {', '.join(map(short, unknown))}. If one of them "
-            "affects the images or cameras, convert these and remove the key."
+            f"affects the images or cameras, convert these and remove the key.{other}"
         )
 
 
@@ -432,6 +434,10 @@ def _standard(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
     for key in {*NUMBERS} & {*found}:
         if isinstance(found[key], str) and (number := number_in(found[key])) is not None:
             found[key] = number
+    for key in {*TIMES} & {*found}:
+        with suppress(TypeError, ValueError):  # Of numbers, and of other text.
+            date = datetime.fromisoformat(found[key])
+            found[key] = (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
     for key in {*FLAGS} & {*found}:
         if isinstance(found[key], str) and found[key].lower() in ("true", "false"):
             found[key] = found[key].lower() == "true"
@@ -555,6 +561,8 @@ def read_calibration(
         # The frame's field of view replaces the file's focal lengths.
         shared = {key: value for key, value in shared.items() if key not in ("fl_x", "fl_y")}
         name, keys = label, frame
+    elif "fl_x" in own:
+        shared.pop("fl_y", None)  # As in instant-ngp, a frame's fl_x alone means square pixels.
     known = shared | own
     model, distortion = _lens(where, content, label, frame)
     bare = Calibration(model=model, distortion=distortion)

@@ -1,0 +1,122 @@
+"""Calibrations of rigs by EasyMocap, of Google's immersive videos, and of CMU Panoptic.
+
+All three give rotations and translations from the world to cameras with OpenCV's axes.
+"""
+
+import json
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from xplanes.errors import SceneError
+from xplanes.scenes.entries import checked_pose, decoded, reading
+from xplanes.scenes.listing import Calibration
+from xplanes.scenes.transforms import read_calibration
+
+FILES = ("extri.yml", "*/extri.yml", "models.json", "calibration_*.json", "*/calibration_*.json")
+"""Files of EasyMocap (with intri.yml beside it), of immersive videos and of CMU Panoptic."""
+
+MATRIX = re.compile(
+    r"^([A-Za-z]+)_(\S+?)\s*:\s*!!opencv-matrix\s+rows:\s*(\d+)\s+cols:\s*(\d+)\s+dt:\s*\w+\s+"
+    r"data:\s*\[([^\]]*)\]|^([HW])_(\S+?)\s*:\s*([\d.]+)\s*$",
+    re.M,
+)
+"""A matrix, or a height or width, in a YAML file of OpenCV."""
+
+Camera = tuple[str, Any, Any, dict[str, Any]]
+"""Name, rotation and translation from the world, and keys as of a transforms file."""
+
+BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""OpenCV's order of coefficients of perspective lenses."""
+
+
+def find_calibration(folder: Path) -> Path | None:
+    """The file of a calibration in a folder or, for some formats, in one inside."""
+    return next((path for pattern in FILES for path in sorted(folder.glob(pattern))), None)
+
+
+def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibration]]:
+    """Name, label, pose and calibration of each camera.
+
+    Args:
+        path: Result of `find_calibration`.
+
+    Raises:
+        SceneError: If the file is not such a calibration.
+    """
+    advice = "Export it again, or write a transforms.json with a frame of each camera."
+    cameras = []
+    with reading(path, "as the calibration of cameras", advice):
+        try:
+            read = _easymocap if path.suffix == ".yml" else _in_json
+            for name, rotation, shift, keys in read(path, decoded(path.read_bytes())):
+                label, turn = f"{path}: {name}", np.array(rotation, dtype=np.float64)
+                turn = turn if turn.size == 9 else _rotation(turn.ravel())
+                pose = np.eye(4)
+                pose[:3, :3] = turn.T * [1, -1, -1]
+                pose[:3, 3] = -turn.T @ np.array(shift, dtype=np.float64).ravel()
+                calibration = read_calibration(label, {}, label, keys)
+                cameras.append((name, label, checked_pose(label, pose, "the pose"), calibration))
+        except (LookupError, TypeError) as problem:
+            raise ValueError(f"an entry is missing or of another kind: {problem}") from problem
+    return cameras
+
+
+def _rotation(vector: np.ndarray) -> np.ndarray:
+    """The rotation about a vector by its length in radians. [3, 3]"""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector / angle if angle else vector
+    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
+
+
+def _lens(matrix: Any, distortion: Any) -> dict[str, Any]:
+    """Keys of a transforms file for a matrix of intrinsics and OpenCV's coefficients."""
+    given = zip(BROWN, np.array(distortion, dtype=np.float64).ravel().tolist(), strict=False)
+    (fl_x, _, cx), (_, fl_y, cy), _ = np.array(matrix, dtype=np.float64).tolist()
+    sides = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
+    return {"camera_model": "FULL_OPENCV", **sides, **dict(given)}
+
+
+def _easymocap(path: Path, content: str) -> Iterable[Camera]:
+    found: dict[tuple[str, str], Any] = {}
+    for text in (content, decoded(path.with_name("intri.yml").read_bytes())):
+        for kind, name, rows, columns, data, side, owner, length in MATRIX.findall(text):
+            if side:
+                found[side, owner] = float(length)
+            else:
+                values = [float(number) for number in re.split(r"[,\s]+", data.strip(", \r\n"))]
+                found[kind, name] = np.reshape(values, (int(rows), int(columns)))
+    names = [name for kind, name in found if kind == "K"]
+    if not names:
+        raise SceneError(f"{path.with_name('intri.yml')} has no matrix K_NAME of a camera.")
+    for name in names:
+        rotation = found["Rot", name] if ("Rot", name) in found else found["R", name]
+        distortion = found.get(("dist", name), found.get(("D", name), []))
+        size = {key.lower(): found[key, name] for key in "WH" if (key, name) in found}
+        yield name, rotation, found["T", name], _lens(found["K", name], distortion) | size
+
+
+def _in_json(path: Path, content: str) -> Iterable[Camera]:
+    cameras = json.loads(content)
+    if isinstance(cameras, dict):  # Of CMU Panoptic.
+        for camera in cameras["cameras"]:
+            size = dict(zip("wh", camera["resolution"], strict=True))
+            lens = _lens(camera["K"], camera["distCoef"])
+            yield camera["name"], camera["R"], camera["t"], lens | size
+        return
+    for camera in cameras:
+        if camera["projection_type"] != "fisheye":
+            raise SceneError(
+                f"{path}: projection_type is {camera['projection_type']}, and fisheye alone is "
+                "read. Undistort the videos, and write a transforms.json with a frame of each."
+            )
+        (cx, cy), focal = camera["principal_point"], camera["focal_length"]
+        keys = {"camera_model": "OPENCV_FISHEYE", "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy}
+        keys |= {"w": camera["width"], "h": camera["height"]}
+        keys |= dict(zip(("k1", "k2"), camera["radial_distortion"], strict=False))
+        rotation = _rotation(np.array(camera["orientation"], dtype=np.float64))
+        yield camera["name"], rotation, -rotation @ np.array(camera["position"]), keys

@@ -8,6 +8,7 @@ import torch
 from tests.training.runs import changed
 from xplanes.rendering import front_to_back, grid_renderer
 from xplanes.rendering.grid_renderer import (
+    BORDER,
     DIAGONAL,
     GridRenderer,
     OccupancySampler,
@@ -259,7 +260,7 @@ def test_what_is_near_the_faces_of_the_cube_costs_most(centre, half):
     found = renderer.render(field, origins, directions, torch.zeros(1).double(), WHITE).border
     places = torch.linspace(centre - half, centre + half, 100_001, dtype=torch.float64)
     light = density * torch.exp(-density * (places - places[0]))
-    wanted = torch.trapezoid(light * places.abs().clamp_min(0.6) ** 4, places)
+    wanted = torch.trapezoid(light * places.abs().clamp_min(0.6) ** BORDER, places)
     assert float(found) == pytest.approx(float(wanted), rel=0.01)
 
 

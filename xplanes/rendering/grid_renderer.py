@@ -59,7 +59,7 @@ DIAGONAL = 2 * math.sqrt(3)
 BEHIND = 0.5
 """Distance behind the cube at which the distortion loss places the background."""
 
-BORDER = 4
+BORDER = 8
 """Power of the distance from the cube's centre in the border loss; its faces are at 1."""
 
 

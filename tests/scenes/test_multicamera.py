@@ -379,6 +379,38 @@ def test_images_of_nearly_equal_times_are_simultaneous(images, kind, gone):
         assert sorted({*views.times.tolist()}) == pytest.approx(times, abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        lambda camera, number: f"take_1.{998 + number}",
+        lambda camera, number: f"{camera}.{98 + number}",
+        lambda camera, number: f"{1 if camera == 1 else camera + 7}.{1 + number:04d}",
+        lambda camera, number: f"{1700000000 + number / 30 + camera * 1e-6:.6f}",
+        # A burst in one camera.
+        lambda camera, number: f"I_20260102_1159{50 + number}{'_1' * (camera == number == 2)}",
+    ],
+)
+def test_numbers_of_takes_and_cameras_are_no_seconds(images, name):
+    stamp(images, name)
+    with told(None):
+        require_all(read(images))
+
+
+@pytest.mark.parametrize("late", [(0, 11, -11, 0), (0, 5, -5, 0)])
+def test_limits_of_time_hold_between_all_cameras(images, late):
+    stamp(images, lambda camera, number: f"{1700000000000 + 40 * number + late[camera]}")
+    if late[1] == 11:  # 22 is more than 0.3 of 40.
+        refuse(images, "that none are simultaneous")
+        return
+    with told(r"different cameras differ by up to 10, and those of one camera by 40\."):
+        require_all(read(images))
+
+
+def test_numbers_of_frames_must_be_equal(images):
+    stamp(images, lambda camera, number: f"{10 * number + camera % 3:05d}")
+    refuse(images, "no number is in the names of images of all cameras .*cam00/00000.png")
+
+
 @pytest.mark.parametrize("kind", ["between", "shifted"])
 def test_cameras_without_simultaneous_frames_are_refused(images, kind):
     late = 20 if kind == "between" else 14

@@ -118,9 +118,10 @@ class MultiCameraSettings(SceneSettings):
                     "cameras to score with data.test_cameras=[NAME], or leave data.eval_split out."
                 )
         watched = _video_camera(cameras, parts, self.video_camera)
-        recordings = _simultaneous([_recording(camera) for camera in cameras])
-        seen = [(recording.images or [recording.camera.source])[0] for recording in recordings]
+        found = [_recording(camera) for camera in cameras]
+        seen = [path for each in found for path in each.images or [each.camera.source]]
         warn_of_masks(folder, seen, "put them into the alpha channel of the cameras' images")
+        recordings = _simultaneous(found)
         poses = torch.from_numpy(np.stack([camera.pose for camera in cameras]))
         poses[:, :3, 3] -= torch.from_numpy(origin_near(folder, poses[:, :3, 3].numpy()))
         images = [image for recording in recordings for image in recording.images[:1]]

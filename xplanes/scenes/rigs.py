@@ -21,7 +21,7 @@ from xplanes.files import natural
 from xplanes.scenes import videos
 from xplanes.scenes.calibrations import find_calibration, read_calibrations
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, image_count, read_model
-from xplanes.scenes.entries import checked_pose, is_positive, paths_inside, reading, some
+from xplanes.scenes.entries import checked_pose, is_positive, paths_inside, reading, some, usable
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import Calibration
 from xplanes.scenes.masks import MASKS
@@ -138,8 +138,7 @@ def _named_apart(cameras: Sequence[Camera]) -> list[Camera]:
 
 def recordings_of_cameras(folder: Path) -> list[Path]:
     """Videos and folders called cam*, else those with numbers such as 00 or view_01, by name."""
-    inside = sorted(filter(_is_recording, folder.iterdir()))
-    inside = [path for path in inside if not OTHER_KINDS.search(camera_name(path))] or inside
+    inside = _colours(sorted(filter(_is_recording, folder.iterdir())))
     numbered = [path for path in inside if NUMBERED.fullmatch(camera_name(path))]
     named = [path for path in inside if CAMERAS.match(camera_name(path))]
     counted = [path for path in named if re.search(r"\d", camera_name(path))]
@@ -188,8 +187,10 @@ def recordings_below(folder: Path, *others: str) -> list[Path]:
         return found
     others = (TIMESTEPS, *others)
     inside = [path for path in folder.iterdir() if path.is_dir() and path.name not in others]
-    inside = [path for path in inside if not OTHER_KINDS.search(path.name)]
     deeper = [paths for path in inside if (paths := recordings_of_cameras(path))]
+    kept = [paths for paths in deeper if not OTHER_KINDS.search(paths[0].parent.name)]
+    if kept or any((folder / name).is_dir() for name in others):
+        deeper = kept
     if len(deeper) > 1:  # Of videos and images extracted from them, videos are read.
         named = [paths for paths in deeper if paths[0].parent.name.lower() in IMAGES]
         deeper = [paths for paths in deeper if all(map(Path.is_file, paths))] or named
@@ -199,9 +200,14 @@ def recordings_below(folder: Path, *others: str) -> list[Path]:
 def recordings_of_rows(folder: Path) -> list[Path]:
     """Recordings with rows in poses_bounds.npy: of any name if there are only videos."""
     inside = sorted(path for path in folder.iterdir() if path.name[0] != ".")
-    loose = [path for path in inside if path.suffix.lower() in videos.SUFFIXES]
-    others = len(loose) < 2 or any(path.name.startswith("images") for path in inside)
-    return recordings_below(folder) or ([] if others else loose)
+    loose = _colours([path for path in inside if path.suffix.lower() in videos.SUFFIXES])
+    images = any(path.name.startswith("images") or path.name.lower() in IMAGES for path in inside)
+    return recordings_below(folder) or ([] if images or len(loose) < 2 else loose)
+
+
+def _colours(paths: Sequence[Path]) -> list[Path]:
+    """Recordings but for masks, depths and the like, if others remain."""
+    return [path for path in paths if not OTHER_KINDS.search(camera_name(path))] or [*paths]
 
 
 def is_rig(folder: Path) -> bool:
@@ -213,6 +219,8 @@ def is_rig(folder: Path) -> bool:
     sources: set[Path] = set()
     try:
         for frame in read_frames(folder / TRANSFORMS)["frames"]:
+            if frame["file_path"] in ("", None):
+                continue
             source = with_frames(_source("", folder.resolve(), frame["file_path"]))
             if source in sources:
                 return False
@@ -304,9 +312,13 @@ def _from_transforms(folder: Path, content: Mapping[str, Any]) -> list[Camera]:
     path = folder / TRANSFORMS
     cameras: dict[Path, Camera] = {}
     content_of = functools.cache(with_frames)  # Many frames may be of one camera.
-    for index, frame in enumerate(content["frames"]):
+
+    def located(item: tuple[int, dict[str, Any]]) -> tuple[str, dict[str, Any], Path]:
+        index, frame = item
         label = f"{path}: frame {index} ({frame['file_path']})"
-        source = _source(label, folder.resolve(), frame["file_path"])
+        return label, frame, _source(label, folder.resolve(), frame["file_path"])
+
+    for label, frame, source in usable("frames", located, [*enumerate(content["frames"])]):
         pose = checked_pose(label, frame["transform_matrix"])
         if (other := cameras.get(content_of(source))) is not None:
             if np.abs(other.pose - pose).max() > SAME_POSE:
@@ -328,21 +340,13 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
     recordings = recordings_below(folder, "images")
     folder = recordings[0].parent if recordings else folder
     sources: dict[str, list[Path]] = defaultdict(list)
-    for path in sorted(folder.iterdir()):
-        if _is_recording(path):
-            sources[camera_name(path)].append(path)
+    for path in _colours(sorted(filter(_is_recording, folder.iterdir()))):
+        sources[camera_name(path)].append(path)
     # Other folders, such as images and sparse, need not be cameras.
     expected = {path for paths in sources.values() for path in paths if path.is_file()}
     expected = sorted(expected | set(recordings))
     sources |= _counted(model, recordings)
     owned: dict[Path, list[str]] = {path: [] for path in expected}
-    folders = Counter(PurePosixPath(name).parent for name in model.names)
-    if len(folders) > 1 and min(folders.values()) > 1:
-        raise SceneError(
-            f"{model.source} has several images of each camera, such as {some(model.names)}. Read "
-            "them all, at the times in their names, with data=colmap; data=multicamera reads the "
-            "frames of cameras of which one image is registered."
-        )
     cameras, problems = [], []
     for name, pose, calibration in zip(
         model.names, model.camera_to_world, model.calibrations, strict=True
@@ -368,6 +372,13 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
     for path, names in owned.items():
         if len(names) > 1 or camera_name(path) not in known:
             problems.append(f"{some(names) or 'no registered image'} belongs to {path.name}")
+    folders = Counter(PurePosixPath(name).parent for name in model.names)
+    if problems and len(folders) > 1 and min(folders.values()) > 1:
+        raise SceneError(
+            f"{model.source} has several images of each camera, such as {some(model.names)}. Read "
+            "them all, at the times in their names, with data=colmap; data=multicamera reads the "
+            "frames of cameras of which one image is registered."
+        )
     if problems:
         raise SceneError(
             f"{model.source}: {some(problems)}. One image of each camera must be registered, and "
@@ -459,6 +470,7 @@ def frames_in(folder: Path) -> list[Path]:
     """
     images = images_in(folder)
     kept = [path for path in images if not OTHER_KINDS.search(path.stem)] or images
+    kept = [path for path in kept if not MASKS.search(path.stem)] or kept
     kept = [path for path in kept if re.search(r"\d", path.stem)] or kept
     kept = list({path.stem: path for path in reversed(kept)}.values())[::-1]
     used = {*kept}

@@ -3,16 +3,15 @@
 All three give rotations and translations from the world to cameras with OpenCV's axes.
 """
 
-import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from xplanes.errors import SceneError
-from xplanes.scenes.entries import checked_pose, decoded, reading
+from xplanes.scenes.entries import checked_pose, decoded, parsed, reading, short, some
 from xplanes.scenes.listing import Calibration
 from xplanes.scenes.transforms import read_calibration
 
@@ -20,11 +19,14 @@ FILES = ("extri.yml", "*/extri.yml", "models.json", "calibration_*.json", "*/cal
 """Files of EasyMocap (with intri.yml beside it), of immersive videos and of CMU Panoptic."""
 
 MATRIX = re.compile(
-    r"^([A-Za-z]+)_(\S+?)\s*:\s*!!opencv-matrix\s+rows:\s*(\d+)\s+cols:\s*(\d+)\s+dt:\s*\w+\s+"
-    r"data:\s*\[([^\]]*)\]|^([HW])_(\S+?)\s*:\s*([\d.]+)\s*$",
+    r"^([A-Za-z]+)_([^:\n]+?)\s*:\s*!!opencv-matrix\s+rows:\s*(\d+)\s+cols:\s*(\d+)\s+dt:\s*\w+\s+"
+    r"data:\s*\[([^\]]*)\]|^([HW])_([^:\n]+?)\s*:\s*([\d.]+)\s*$",
     re.M,
 )
 """A matrix, or a height or width, in a YAML file of OpenCV."""
+
+OWNER = re.compile(r"^(?:K|Rot|R|T)_([^:\n]+?)\s*:", re.M)
+"""The name of a camera, at the beginning of one of its matrices."""
 
 Camera = tuple[str, Any, Any, dict[str, Any]]
 """Name, rotation and translation from the world, and keys as of a transforms file."""
@@ -32,10 +34,27 @@ Camera = tuple[str, Any, Any, dict[str, Any]]
 BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's order of coefficients of perspective lenses."""
 
+TO_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+"""Added to OpenCV's intrinsics, as the first pixel's centre is at 0 there, and at 0.5 here."""
+
+MOST_SKEW = 1e-3
+"""Largest skew that is left out, in pixels."""
+
+ADVICE = "Export it again, or write a transforms.json with a frame of each camera."
+
 
 def find_calibration(folder: Path) -> Path | None:
-    """The file of a calibration in a folder or, for some formats, in one inside."""
-    return next((path for pattern in FILES for path in sorted(folder.glob(pattern))), None)
+    """The file of a calibration in a folder or, for some formats, in the only one inside."""
+    for pattern in FILES:
+        found = sorted(path for path in folder.glob(pattern) if path.is_file())
+        if len({path.parent for path in found}) == 1:  # Several folders are as many scenes.
+            return next((path for path in found if _is_of_folder(path)), found[0])
+    return None
+
+
+def _is_of_folder(path: Path) -> bool:
+    """Whether a calibration has the name of its folder, as those of CMU Panoptic have."""
+    return path.stem == f"calibration_{path.parent.resolve().name}"
 
 
 def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibration]]:
@@ -45,14 +64,20 @@ def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibratio
         path: Result of `find_calibration`.
 
     Raises:
-        SceneError: If the file is not such a calibration.
+        SceneError: If the file is not such a calibration, or if it is one of several.
     """
-    advice = "Export it again, or write a transforms.json with a frame of each camera."
-    cameras = []
-    with reading(path, "as the calibration of cameras", advice):
+    cameras, rivals = [], sorted(each.name for each in path.parent.glob("calibration_*.json"))
+    if path.name in rivals and len(rivals) > 1 and not _is_of_folder(path):
+        raise SceneError(
+            f"{path.parent} holds {len(rivals)} calibrations: {some(rivals)}. Move all but one "
+            "elsewhere, or give it the folder's name: calibration_FOLDER.json."
+        )
+    with reading(path, "as the calibration of cameras", ADVICE):
         try:
             read = _easymocap if path.suffix == ".yml" else _in_json
             for name, rotation, shift, keys in read(path, decoded(path.read_bytes())):
+                if not isinstance(name, str):
+                    raise TypeError(f"name is {short(name)}")
                 label, turn = f"{path}: {name}", np.array(rotation, dtype=np.float64)
                 turn = turn if turn.size == 9 else _rotation(turn.ravel())
                 pose = np.eye(4)
@@ -62,6 +87,8 @@ def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibratio
                 cameras.append((name, label, checked_pose(label, pose, "the pose"), calibration))
         except (LookupError, TypeError) as problem:
             raise ValueError(f"an entry is missing or of another kind: {problem}") from problem
+    if not cameras:
+        raise SceneError(f"{path} holds no camera. {ADVICE}")
     return cameras
 
 
@@ -73,39 +100,55 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
 
 
-def _lens(matrix: Any, distortion: Any) -> dict[str, Any]:
+def _lens(label: str, matrix: Any, distortion: Any) -> dict[str, Any]:
     """Keys of a transforms file for a matrix of intrinsics and OpenCV's coefficients."""
-    given = zip(BROWN, np.array(distortion, dtype=np.float64).ravel().tolist(), strict=False)
-    (fl_x, _, cx), (_, fl_y, cy), _ = np.array(matrix, dtype=np.float64).tolist()
+    (fl_x, skew, cx), (_, fl_y, cy), _ = np.array(matrix, dtype=np.float64).tolist()
+    if abs(skew) > MOST_SKEW:
+        raise SceneError(
+            f"{label}: the skew is {skew:g} pixels, and none is read. Undistort the images, or "
+            "calibrate without it."
+        )
     sides = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
-    return {"camera_model": "FULL_OPENCV", **sides, **dict(given)}
+    return {"camera_model": "FULL_OPENCV", **sides, **_coefficients(label, BROWN, distortion)}
+
+
+def _coefficients(label: str, names: Sequence[str], values: Any) -> dict[str, float]:
+    """Coefficients of distortion by name."""
+    found = np.array(values, dtype=np.float64).ravel().tolist()
+    if any(found[len(names) :]):
+        raise SceneError(
+            f"{label}: {short(found[len(names) :])} are coefficients of distortion after "
+            f"{names[-1]}, and not read. Undistort the images, or calibrate without them."
+        )
+    return dict(zip(names, found, strict=False))
 
 
 def _easymocap(path: Path, content: str) -> Iterable[Camera]:
     found: dict[tuple[str, str], Any] = {}
+    names: dict[str, None] = {}
     for text in (content, decoded(path.with_name("intri.yml").read_bytes())):
+        names |= dict.fromkeys(OWNER.findall(text))
         for kind, name, rows, columns, data, side, owner, length in MATRIX.findall(text):
             if side:
                 found[side, owner] = float(length)
             else:
                 values = [float(number) for number in re.split(r"[,\s]+", data.strip(", \r\n"))]
                 found[kind, name] = np.reshape(values, (int(rows), int(columns)))
-    names = [name for kind, name in found if kind == "K"]
-    if not names:
-        raise SceneError(f"{path.with_name('intri.yml')} has no matrix K_NAME of a camera.")
     for name in names:
         rotation = found["Rot", name] if ("Rot", name) in found else found["R", name]
         distortion = found.get(("dist", name), found.get(("D", name), []))
         size = {key.lower(): found[key, name] for key in "WH" if (key, name) in found}
-        yield name, rotation, found["T", name], _lens(found["K", name], distortion) | size
+        label = f"{path.with_name('intri.yml')}: {name}"
+        lens = _lens(label, np.array(found["K", name]) + TO_CORNER, distortion)
+        yield name, rotation, found["T", name], lens | size
 
 
 def _in_json(path: Path, content: str) -> Iterable[Camera]:
-    cameras = json.loads(content)
+    cameras = parsed(content)
     if isinstance(cameras, dict):  # Of CMU Panoptic.
         for camera in cameras["cameras"]:
             size = dict(zip("wh", camera["resolution"], strict=True))
-            lens = _lens(camera["K"], camera["distCoef"])
+            lens = _lens(f"{path}: {camera['name']}", camera["K"], camera["distCoef"])
             yield camera["name"], camera["R"], camera["t"], lens | size
         return
     for camera in cameras:
@@ -117,6 +160,7 @@ def _in_json(path: Path, content: str) -> Iterable[Camera]:
         (cx, cy), focal = camera["principal_point"], camera["focal_length"]
         keys = {"camera_model": "OPENCV_FISHEYE", "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy}
         keys |= {"w": camera["width"], "h": camera["height"]}
-        keys |= dict(zip(("k1", "k2"), camera["radial_distortion"], strict=False))
+        label = f"{path}: {camera['name']}"
+        keys |= _coefficients(label, ("k1", "k2"), camera["radial_distortion"])
         rotation = _rotation(np.array(camera["orientation"], dtype=np.float64))
         yield camera["name"], rotation, -rotation @ np.array(camera["position"]), keys

@@ -265,7 +265,7 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
         SceneError: If it cannot be read, or is not an object.
     """
     with reading(path, "as JSON", "Export or download it again."):
-        found = _parsed(_text(path))
+        found = parsed(_text(path))
     if not isinstance(found, dict):
         raise SceneError(f"{path} must hold a JSON object with {content}, not {short(found)}.")
     return found
@@ -281,7 +281,7 @@ def _text(path: Path) -> str:
         return content.decode("latin-1")
 
 
-def _parsed(text: str) -> Any:
+def parsed(text: str) -> Any:
     """Parse JSON that may have comments and trailing commas."""
     try:
         return json.loads(text)

@@ -7,9 +7,11 @@ another program (`calibrations`).
 """
 
 import functools
+import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -163,18 +165,25 @@ def are_registered(folder: Path) -> bool:
 
 def is_calibrated(folder: Path) -> bool:
     """Whether another program's calibration is the only one, and names two recordings or more."""
-    path = find_calibration(folder)
-    if path is None or any(folder.glob("transforms*.json")) or find_model(folder):
-        return False
-    text = path.read_text(encoding="utf-8", errors="replace")
-    names = _recordings_of_any_name(folder)
-    return sum(bool(re.search(rf'["_]{re.escape(name)}\b', text)) for name in names) > 1
+    with suppress(OSError):  # The user may not have access to some files.
+        path = find_calibration(folder)
+        if path is None or any(folder.glob("transforms*.json")) or find_model(folder):
+            return False
+        content = path.read_bytes()
+        text = content.decode(json.detect_encoding(content), "replace")
+        names = _recordings_of_any_name(folder, path)
+        return sum(bool(re.search(rf'["_]{re.escape(name)}\b', text)) for name in names) > 1
+    return False
 
 
-def _recordings_of_any_name(folder: Path) -> dict[str, Path]:
-    """Videos, or else folders of images, in a folder or in one inside, by camera."""
-    inside = [path for path in folder.iterdir() if path.is_dir() and path.name[0] != "."]
+def _recordings_of_any_name(folder: Path, calibration: Path) -> dict[str, Path]:
+    """Videos, or else folders of images, in a folder or in one inside, by camera.
+
+    Folders inside with a calibration of their own are other scenes.
+    """
+    inside = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != "."]
     places = [folder, *(path for path in inside if not OTHER_KINDS.search(path.name))]
+    places = [path for path in places if find_calibration(path) in (calibration, None)]
     found = [path for place in places for path in sorted(filter(_is_recording, place.iterdir()))]
     # EasyMocap extracts images from videos, and programs write folders of the same names.
     found.sort(key=lambda path: (path.is_file(), path.parent.name.lower() in IMAGES))
@@ -393,7 +402,7 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
 
 def _from_calibration(folder: Path, path: Path) -> list[Camera]:
     """Those cameras of another program's calibration that have a recording."""
-    sources, cameras, lost = _recordings_of_any_name(folder), [], []
+    sources, cameras, lost = _recordings_of_any_name(folder, path), [], []
     for name, label, pose, calibration in read_calibrations(path):
         if (source := sources.get(name)) is None:
             lost.append(name)
@@ -404,9 +413,20 @@ def _from_calibration(folder: Path, path: Path) -> list[Camera]:
             f"{path}: none of its cameras has a video or a folder of images of its name, such as "
             f"images/{lost[0]} or videos/{lost[0]}.mp4. Add them to {folder}."
         )
+    total, read = len(lost) + len(cameras), {camera.source: camera.name for camera in cameras}
+    if path.match("calibration_*"):  # Panels of CMU Panoptic are recorded, and fetched, as a whole.
+        panels = {name.split("_")[0] for name in read.values()}
+        lost = [name for name in lost if name.split("_")[0] in panels]
+    places = {source.parent for source in read}
+    others = [source for source in _colours([*sources.values()]) if source.parent in places]
+    if others := [source.name for source in others if source not in read]:
+        warn(
+            f"{path} has no camera of {some(others)}. {len(others)} are left out: add their "
+            "calibration, or move them elsewhere."
+        )
     if lost:
         warn(
-            f"{path}: {len(lost)} of {len(lost) + len(cameras)} cameras have no video or folder of "
+            f"{path}: {len(lost)} of {total} cameras have no video or folder of "
             f"images of their name and are left out: {some(lost)}."
         )
     return cameras

@@ -205,6 +205,7 @@ def test_folders_of_scenes_are_no_rig(tmp_path, kind):
 def test_scenes_inside_another_are_not_mixed_with_it(tmp_path):
     names = build(tmp_path, "EasyMocap's vectors")
     write(tmp_path / "images_2", "EasyMocap's vectors", names)
+    (tmp_path / "images/link").symlink_to("..")
     for name in [*names, "07"]:
         save(tmp_path / "images_2" / name / "0.jpg", picture(0))
     with told(None):

@@ -52,6 +52,12 @@ def find_calibration(folder: Path) -> Path | None:
     return None
 
 
+def has_calibration(folder: Path) -> bool:
+    """Whether a folder itself holds a calibration."""
+    patterns = [pattern for pattern in FILES if "/" not in pattern]
+    return any(path.is_file() for pattern in patterns for path in folder.glob(pattern))
+
+
 def _is_of_folder(path: Path) -> bool:
     """Whether a calibration has the name of its folder, as those of CMU Panoptic have."""
     return path.stem == f"calibration_{path.parent.resolve().name}"

@@ -200,7 +200,9 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
     elif not PureWindowsPath(name).anchor:
         # The file of the cameras may have been moved up, out of a folder beside the images.
         inner = PurePosixPath(spelt(name).replace("../", ""))
-        if whole.exists() or not any((folder / f"{inner}{suffix}").exists() for suffix in SUFFIXES):
+        places = (whole, folder / inner)
+        outside, inside = ([f"{path}{suffix}" for suffix in SUFFIXES] for path in places)
+        if any(map(os.path.exists, outside)) or not any(map(os.path.exists, inside)):
             raise SceneError(
                 f"{label}: {key} leaves the scene's folder {folder} (it is {name}). Put its files "
                 f"inside the folder and correct {key}."

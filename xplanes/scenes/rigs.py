@@ -21,7 +21,7 @@ import numpy as np
 from xplanes.errors import SceneError, warn
 from xplanes.files import natural
 from xplanes.scenes import videos
-from xplanes.scenes.calibrations import find_calibration, read_calibrations
+from xplanes.scenes.calibrations import find_calibration, has_calibration, read_calibrations
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, image_count, read_model
 from xplanes.scenes.entries import checked_pose, is_positive, paths_inside, reading, some, usable
 from xplanes.scenes.formats import is_image
@@ -182,9 +182,9 @@ def _recordings_of_any_name(folder: Path, calibration: Path) -> dict[str, Path]:
     Folders inside with a calibration of their own are other scenes.
     """
     inside = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != "."]
-    places = [folder, *(path for path in inside if not OTHER_KINDS.search(path.name))]
-    places = [path for path in places if find_calibration(path) in (calibration, None)]
-    found = [path for place in places for path in sorted(filter(_is_recording, place.iterdir()))]
+    inside = [path for path in inside if not OTHER_KINDS.search(path.name)]
+    own = [path for path in inside if path == calibration.parent or not has_calibration(path)]
+    found = [path for p in (folder, *own) for path in sorted(filter(_is_recording, p.iterdir()))]
     # EasyMocap extracts images from videos, and programs write folders of the same names.
     found.sort(key=lambda path: (path.is_file(), path.parent.name.lower() in IMAGES))
     return {camera_name(path).removeprefix("hd_"): path for path in found if _is_filled(path)}
@@ -419,7 +419,7 @@ def _from_calibration(folder: Path, path: Path) -> list[Camera]:
         lost = [name for name in lost if name.split("_")[0] in panels]
     places = {source.parent for source in read}
     others = [source for source in _colours([*sources.values()]) if source.parent in places]
-    if others := [source.name for source in others if source not in read]:
+    if others := [path.name for path in others if path not in read and path.name[0] != "."]:
         warn(
             f"{path} has no camera of {some(others)}. {len(others)} are left out: add their "
             "calibration, or move them elsewhere."

@@ -15,7 +15,7 @@ from xplanes.scenes.entries import checked_pose, decoded, parsed, reading, short
 from xplanes.scenes.listing import Calibration
 from xplanes.scenes.transforms import read_calibration
 
-FILES = ("extri.yml", "*/extri.yml", "models.json", "calibration_*.json", "*/calibration_*.json")
+FILES = ("extri.yml", "models.json", "calibration_*.json", "*/extri.yml", "*/calibration_*.json")
 """Files of EasyMocap (with intri.yml beside it), of immersive videos and of CMU Panoptic."""
 
 MATRIX = re.compile(
@@ -34,33 +34,17 @@ Camera = tuple[str, Any, Any, dict[str, Any]]
 BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's order of coefficients of perspective lenses."""
 
-TO_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-"""Added to OpenCV's intrinsics, as the first pixel's centre is at 0 there, and at 0.5 here."""
-
-MOST_SKEW = 1e-3
-"""Largest skew that is left out, in pixels."""
-
-ADVICE = "Export it again, or write a transforms.json with a frame of each camera."
+NONE = 1e-6
+"""Skew and coefficients of distortion up to this stand for none."""
 
 
-def find_calibration(folder: Path) -> Path | None:
+def find_calibration(folder: Path, patterns: Sequence[str] = FILES) -> Path | None:
     """The file of a calibration in a folder or, for some formats, in the only one inside."""
-    for pattern in FILES:
+    for pattern in patterns:
         found = sorted(path for path in folder.glob(pattern) if path.is_file())
         if len({path.parent for path in found}) == 1:  # Several folders are as many scenes.
-            return next((path for path in found if _is_of_folder(path)), found[0])
+            return found[0]
     return None
-
-
-def has_calibration(folder: Path) -> bool:
-    """Whether a folder itself holds a calibration."""
-    patterns = [pattern for pattern in FILES if "/" not in pattern]
-    return any(path.is_file() for pattern in patterns for path in folder.glob(pattern))
-
-
-def _is_of_folder(path: Path) -> bool:
-    """Whether a calibration has the name of its folder, as those of CMU Panoptic have."""
-    return path.stem == f"calibration_{path.parent.resolve().name}"
 
 
 def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibration]]:
@@ -72,13 +56,14 @@ def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibratio
     Raises:
         SceneError: If the file is not such a calibration, or if it is one of several.
     """
+    advice = "Export it again, or write a transforms.json with a frame of each camera."
     cameras, rivals = [], sorted(each.name for each in path.parent.glob("calibration_*.json"))
-    if path.name in rivals and len(rivals) > 1 and not _is_of_folder(path):
+    if path.name in rivals[:1] and len(rivals) > 1:
         raise SceneError(
             f"{path.parent} holds {len(rivals)} calibrations: {some(rivals)}. Move all but one "
-            "elsewhere, or give it the folder's name: calibration_FOLDER.json."
+            "elsewhere."
         )
-    with reading(path, "as the calibration of cameras", ADVICE):
+    with reading(path, "as the calibration of cameras", advice):
         try:
             read = _easymocap if path.suffix == ".yml" else _in_json
             for name, rotation, shift, keys in read(path, decoded(path.read_bytes())):
@@ -93,8 +78,8 @@ def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibratio
                 cameras.append((name, label, checked_pose(label, pose, "the pose"), calibration))
         except (LookupError, TypeError) as problem:
             raise ValueError(f"an entry is missing or of another kind: {problem}") from problem
-    if not cameras:
-        raise SceneError(f"{path} holds no camera. {ADVICE}")
+        if not cameras:
+            raise ValueError("it holds no camera")
     return cameras
 
 
@@ -106,46 +91,43 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
 
 
-def _lens(label: str, matrix: Any, distortion: Any) -> dict[str, Any]:
-    """Keys of a transforms file for a matrix of intrinsics and OpenCV's coefficients."""
+def _lens(label: str, matrix: Any, distortion: Any, corner: float = 0) -> dict[str, Any]:
+    """Keys of a transforms file for OpenCV's intrinsics, and the place of its origin."""
     (fl_x, skew, cx), (_, fl_y, cy), _ = np.array(matrix, dtype=np.float64).tolist()
-    if abs(skew) > MOST_SKEW:
-        raise SceneError(
-            f"{label}: the skew is {skew:g} pixels, and none is read. Undistort the images, or "
-            "calibrate without it."
-        )
-    sides = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
-    return {"camera_model": "FULL_OPENCV", **sides, **_coefficients(label, BROWN, distortion)}
+    sides = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx + corner, "cy": cy + corner}
+    lens = _coefficients(label, BROWN, distortion, skew)
+    return {"camera_model": "FULL_OPENCV", **sides, **lens}
 
 
-def _coefficients(label: str, names: Sequence[str], values: Any) -> dict[str, float]:
-    """Coefficients of distortion by name."""
+def _coefficients(
+    label: str, names: Sequence[str], values: Any, skew: float = 0
+) -> dict[str, float]:
+    """Coefficients of distortion by name; refuses others, and skew."""
     found = np.array(values, dtype=np.float64).ravel().tolist()
-    if any(found[len(names) :]):
+    if lost := [value for value in (skew, *found[len(names) :]) if abs(value) > NONE]:
         raise SceneError(
-            f"{label}: {short(found[len(names) :])} are coefficients of distortion after "
-            f"{names[-1]}, and not read. Undistort the images, or calibrate without them."
+            f"{label}: skew or coefficients after {names[-1]} are not read, but are {short(lost)}. "
+            "Undistort the images, or calibrate without them."
         )
     return dict(zip(names, found, strict=False))
 
 
 def _easymocap(path: Path, content: str) -> Iterable[Camera]:
     found: dict[tuple[str, str], Any] = {}
-    names: dict[str, None] = {}
-    for text in (content, decoded(path.with_name("intri.yml").read_bytes())):
-        names |= dict.fromkeys(OWNER.findall(text))
-        for kind, name, rows, columns, data, side, owner, length in MATRIX.findall(text):
-            if side:
-                found[side, owner] = float(length)
-            else:
-                values = [float(number) for number in re.split(r"[,\s]+", data.strip(", \r\n"))]
-                found[kind, name] = np.reshape(values, (int(rows), int(columns)))
-    for name in names:
+    text = f"{content}\n{decoded(path.with_name('intri.yml').read_bytes())}"
+    for kind, name, rows, columns, data, side, owner, length in MATRIX.findall(text):
+        if side:
+            found[side, owner] = float(length)
+        else:
+            values = [float(number) for number in re.split(r"[,\s]+", data.strip(", \r\n"))]
+            found[kind, name] = np.reshape(values, (int(rows), int(columns)))
+    for name in dict.fromkeys(OWNER.findall(text)):
         rotation = found["Rot", name] if ("Rot", name) in found else found["R", name]
         distortion = found.get(("dist", name), found.get(("D", name), []))
         size = {key.lower(): found[key, name] for key in "WH" if (key, name) in found}
         label = f"{path.with_name('intri.yml')}: {name}"
-        lens = _lens(label, np.array(found["K", name]) + TO_CORNER, distortion)
+        # Pixel centres are at whole numbers in OpenCV.
+        lens = _lens(label, found["K", name], distortion, corner=0.5)
         yield name, rotation, found["T", name], lens | size
 
 

@@ -201,8 +201,8 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
         # The file of the cameras may have been moved up, out of a folder beside the images.
         inner = PurePosixPath(spelt(name).replace("../", ""))
         places = (whole, folder / inner)
-        outside, inside = ([f"{path}{suffix}" for suffix in SUFFIXES] for path in places)
-        if any(map(os.path.exists, outside)) or not any(map(os.path.exists, inside)):
+        there = [any(Path(f"{place}{end}").exists() for end in SUFFIXES) for place in places]
+        if there != [False, True]:
             raise SceneError(
                 f"{label}: {key} leaves the scene's folder {folder} (it is {name}). Put its files "
                 f"inside the folder and correct {key}."

@@ -52,9 +52,6 @@ MOST_DRIFT = 0.5
 NEAR = 0.3
 """A larger difference between times of images, in intervals, is one between timesteps."""
 
-SAME = 1e-3
-"""Largest difference between equal times of images, in intervals."""
-
 FIRST_CLOCK, LONG = 10**5, 10**8
 """Least whole numbers that may be of clocks rather than frames, and least seconds that are."""
 
@@ -322,7 +319,7 @@ def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
         if len(numbers) < len(recordings):
             raise SceneError(f"{text}. Add what is missing, or extract the images of all videos.")
         warn(f"{text}. {len(lost)} images are left out.")
-    if apart > SAME * step:
+    if apart > 1e-3 * step:  # Or else times are rounded.
         warn(
             f"{folder}: images of the nearest numbers are taken to be simultaneous, as those of "
             f"different cameras differ by up to {apart:.3g}, and those of one camera by "
@@ -345,16 +342,12 @@ def _numbers(recordings: Sequence[Recording]) -> dict[int, list[Number]]:
     """Of each camera with images, their times, floats, if all have clocks; else whole numbers."""
     named = [(camera, each.images) for camera, each in enumerate(recordings) if each.images]
     times = {camera: times_of_clocks([path.name for path in own]) for camera, own in named}
-    if all(map(_are_clocks, times.values())):
+    # Clocks go on, and take and frame, as in 1.998 and 1.999, are none.
+    rising = all(own and all(one < other for one, other in pairwise(own)) for own in times.values())
+    if rising and all(own[0] >= LONG or int(own[0]) < int(own[-1]) for own in times.values()):
         return times
     found = {camera: most_different([path.stem for path in own]) for camera, own in named}
     return {camera: numbers for camera, numbers in found.items() if numbers}
-
-
-def _are_clocks(times: Sequence[Number]) -> bool:
-    """Whether times increase, and are not the numbers of a take and a frame, as 1.998 may be."""
-    rises = bool(times) and all(one < other for one, other in pairwise(times))
-    return rises and (times[0] >= LONG or int(times[0]) < int(times[-1]))
 
 
 def _counts(recordings: Sequence[Recording]) -> str:

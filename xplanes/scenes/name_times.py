@@ -34,8 +34,8 @@ SIDE = re.compile(
 )
 """The name of a camera by its place, as in left_0001."""
 
-MOST_DIGITS = 3
-"""Digits of a camera's number; longer ones may be those of frames, as in cam_0001."""
+FRAME = re.compile(r"(?i)\d{4}|^[cv]\d{3}")
+"""A number that may be of a frame even after the word for a camera, as in cam_0001."""
 
 MOST_CAMERAS = 64
 """Number of images up to which numbers of cameras are taken for these, as in cam00 to cam19."""
@@ -89,8 +89,7 @@ def times_in_names(
         if len(set(found)) > 1 or (found and len(names) == 1):
             break
     cameras = _cameras(stems) if texts is stems and len(names) > 1 else []
-    few = len(names) <= MOST_CAMERAS and not any(map(CLIP.fullmatch, cameras))
-    few &= all(len(re.sub(r"\D", "", camera)) <= MOST_DIGITS for camera in cameras)
+    few = len(names) <= MOST_CAMERAS and not any(map(FRAME.search, cameras))
     why = _no_series(names, stems, found)
     if not why and cameras and few and not dynamic:
         why = (

@@ -21,7 +21,7 @@ import numpy as np
 from xplanes.errors import SceneError, warn
 from xplanes.files import natural
 from xplanes.scenes import videos
-from xplanes.scenes.calibrations import find_calibration, has_calibration, read_calibrations
+from xplanes.scenes.calibrations import FILES, find_calibration, read_calibrations
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, image_count, read_model
 from xplanes.scenes.entries import checked_pose, is_positive, paths_inside, reading, some, usable
 from xplanes.scenes.formats import is_image
@@ -167,27 +167,27 @@ def is_calibrated(folder: Path) -> bool:
     """Whether another program's calibration is the only one, and names two recordings or more."""
     with suppress(OSError):  # The user may not have access to some files.
         path = find_calibration(folder)
-        if path is None or any(folder.glob("transforms*.json")) or find_model(folder):
-            return False
-        content = path.read_bytes()
-        text = content.decode(json.detect_encoding(content), "replace")
-        names = _recordings_of_any_name(folder, path)
-        return sum(bool(re.search(rf'["_]{re.escape(name)}\b', text)) for name in names) > 1
+        if path and not (any(folder.glob("transforms*.json")) or find_model(folder)):
+            content = path.read_bytes()
+            text = content.decode(json.detect_encoding(content), "replace")
+            names = _recordings_of_any_name(folder, path)
+            return sum(bool(re.search(rf'["_]{re.escape(name)}\b', text)) for name in names) > 1
     return False
 
 
 def _recordings_of_any_name(folder: Path, calibration: Path) -> dict[str, Path]:
-    """Videos, or else folders of images, in a folder or in one inside, by camera.
-
-    Folders inside with a calibration of their own are other scenes.
-    """
+    """Videos, or else folders of images, in a folder or in one inside, by camera."""
     inside = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != "."]
-    inside = [path for path in inside if not OTHER_KINDS.search(path.name)]
-    own = [path for path in inside if path == calibration.parent or not has_calibration(path)]
-    found = [path for p in (folder, *own) for path in sorted(filter(_is_recording, p.iterdir()))]
+    # Other folders with a calibration are other scenes.
+    own = [p for p in inside if p == calibration.parent or not find_calibration(p, FILES[:3])]
+    found = [path for p in (folder, *_colours(own)) for path in sorted(p.iterdir())]
     # EasyMocap extracts images from videos, and programs write folders of the same names.
     found.sort(key=lambda path: (path.is_file(), path.parent.name.lower() in IMAGES))
-    return {camera_name(path).removeprefix("hd_"): path for path in found if _is_filled(path)}
+    return {
+        camera_name(path).removeprefix("hd_"): path
+        for path in found
+        if _is_recording(path) and _is_filled(path)
+    }
 
 
 def recordings_below(folder: Path, *others: str) -> list[Path]:
@@ -254,7 +254,7 @@ def _is_filled(path: Path) -> bool:
 
 
 def _is_recording(path: Path) -> bool:
-    return path.is_dir() or path.suffix.lower() in videos.SUFFIXES
+    return path.name[0] != "." and (path.is_dir() or path.suffix.lower() in videos.SUFFIXES)
 
 
 def _from_poses_bounds(folder: Path) -> list[Camera]:
@@ -413,20 +413,19 @@ def _from_calibration(folder: Path, path: Path) -> list[Camera]:
             f"{path}: none of its cameras has a video or a folder of images of its name, such as "
             f"images/{lost[0]} or videos/{lost[0]}.mp4. Add them to {folder}."
         )
-    total, read = len(lost) + len(cameras), {camera.source: camera.name for camera in cameras}
     if path.match("calibration_*"):  # Panels of CMU Panoptic are recorded, and fetched, as a whole.
-        panels = {name.split("_")[0] for name in read.values()}
+        panels = {camera.name.split("_")[0] for camera in cameras}
         lost = [name for name in lost if name.split("_")[0] in panels]
-    places = {source.parent for source in read}
-    others = [source for source in _colours([*sources.values()]) if source.parent in places]
-    if others := [path.name for path in others if path not in read and path.name[0] != "."]:
+    read = {camera.source for camera in cameras}
+    others = [other for other in _colours([*sources.values()]) if other not in read]
+    if others := [other.name for other in others if other.parent in {own.parent for own in read}]:
         warn(
             f"{path} has no camera of {some(others)}. {len(others)} are left out: add their "
             "calibration, or move them elsewhere."
         )
     if lost:
         warn(
-            f"{path}: {len(lost)} of {total} cameras have no video or folder of "
+            f"{path}: {len(lost)} of {len(lost) + len(cameras)} cameras have no video or folder of "
             f"images of their name and are left out: {some(lost)}."
         )
     return cameras

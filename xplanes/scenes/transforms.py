@@ -489,18 +489,13 @@ def read_frames(path: Path) -> dict[str, Any]:
                 "key."
             )
     frames = [_standard(path, each) for each in frames]
-    _convert_dates(frames)
-    return _standard(path, content) | {"frames": frames}
-
-
-def _convert_dates(frames: Sequence[dict[str, Any]]) -> None:
-    """Convert dates to seconds, unless other frames have numbers."""
     for key in TIMES:
         timed = [frame for frame in frames if frame.get(key) is not None]
-        with suppress(TypeError, ValueError):  # Of numbers, and of other text.
+        with suppress(TypeError, ValueError):  # If one has a number, or other text.
             dates = [datetime.fromisoformat(frame[key]) for frame in timed]
             for frame, date in zip(timed, dates, strict=True):
                 frame[key] = (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
+    return _standard(path, content) | {"frames": frames}
 
 
 def stated_up(content: Mapping[str, Any], orient: bool | None) -> tuple[bool | None, Tensor | None]:
@@ -535,8 +530,7 @@ def _times(
     key = _time_key([frame.entry for frame in frames])
     if frames[0].entry.get(key) is None:
         return [], ""
-    more = ", or a date in all frames"
-    times = [checked_number(frame.label, key, frame.entry[key], more=more) for frame in frames]
+    times = [checked_number(f.label, key, f.entry[key], more=", or all dates") for f in frames]
     names = [frame.entry["file_path"] for frame in frames]
     source = time_source(f'"{key}" of {path.name}', names, times)
     first, last = span or (min(times), max(times))

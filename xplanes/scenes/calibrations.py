@@ -60,8 +60,7 @@ def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibratio
     cameras, rivals = [], sorted(each.name for each in path.parent.glob("calibration_*.json"))
     if path.name in rivals[:1] and len(rivals) > 1:
         raise SceneError(
-            f"{path.parent} holds {len(rivals)} calibrations: {some(rivals)}. Move all but one "
-            "elsewhere."
+            f"{path.parent} holds {len(rivals)} calibrations: {some(rivals)}. Keep only one there."
         )
     with reading(path, "as the calibration of cameras", advice):
         try:

@@ -342,7 +342,7 @@ def _numbers(recordings: Sequence[Recording]) -> dict[int, list[Number]]:
     """Of each camera with images, their times, floats, if all have clocks; else whole numbers."""
     named = [(camera, each.images) for camera, each in enumerate(recordings) if each.images]
     times = {camera: times_of_clocks([path.name for path in own]) for camera, own in named}
-    # Clocks go on, and take and frame, as in 1.998 and 1.999, are none.
+    # Clocks run on; the numbers of a take and a frame, as in 1.998 and 1.999, are none.
     rising = all(own and all(one < other for one, other in pairwise(own)) for own in times.values())
     if rising and all(own[0] >= LONG or int(own[0]) < int(own[-1]) for own in times.values()):
         return times

@@ -177,17 +177,13 @@ def is_calibrated(folder: Path) -> bool:
 
 def _recordings_of_any_name(folder: Path, calibration: Path) -> dict[str, Path]:
     """Videos, or else folders of images, in a folder or in one inside, by camera."""
-    inside = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != "."]
+    inside = _colours(sorted(p for p in folder.iterdir() if p.is_dir() and _is_recording(p)))
     # Other folders with a calibration are other scenes.
     own = [p for p in inside if p == calibration.parent or not find_calibration(p, FILES[:3])]
-    found = [path for p in (folder, *_colours(own)) for path in sorted(p.iterdir())]
+    found = [path for p in (folder, *own) for path in sorted(filter(_is_recording, p.iterdir()))]
     # EasyMocap extracts images from videos, and programs write folders of the same names.
     found.sort(key=lambda path: (path.is_file(), path.parent.name.lower() in IMAGES))
-    return {
-        camera_name(path).removeprefix("hd_"): path
-        for path in found
-        if _is_recording(path) and _is_filled(path)
-    }
+    return {camera_name(path).removeprefix("hd_"): path for path in found if _is_filled(path)}
 
 
 def recordings_below(folder: Path, *others: str) -> list[Path]:

@@ -2,6 +2,7 @@
 
 import json
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from xplanes.scenes.lenses import COEFFICIENTS
 from xplanes.scenes.multicamera import MultiCameraSettings
 
 POSES = poses(4)
-K = [[OPENCV[0], 0, OPENCV[2]], [0, OPENCV[1], OPENCV[3]], [0, 0, 1]]
+K = np.array([[OPENCV[0], 0, OPENCV[2]], [0, OPENCV[1], OPENCV[3]], [0, 0, 1]])
+HALF = [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
 DISTORTION = dict(zip(("k1", "k2", "p1", "p2"), OPENCV[4:], strict=True))
 FISHEYE = {"k1": 0.02, "k2": -0.01}
 VECTORS = {"EasyMocap's vectors", "immersive"}
@@ -50,7 +52,7 @@ def write(folder, kind, names):
         place.mkdir(exist_ok=True)
         head = "%YAML:1.0\r\n---\r\nnames:\r\n" + "".join(f'  - "{name}"\r\n' for name in names)
         lens = [[*DISTORTION.values(), 0.0]]
-        own = [matrix(f"K_{n}", K) + matrix(f"dist_{n}", lens) for n in names]
+        own = [matrix(f"K_{n}", K - HALF) + matrix(f"dist_{n}", lens) for n in names]
         own += [f"H_{n}: {HEIGHT}\r\nW_{n}: {WIDTH}\r\n" for n in names]
         key = "R" if by_vector else "Rot"
         places = [matrix(f"{key}_{n}", r) + matrix(f"T_{n}", t) for n, r, t in each]
@@ -70,7 +72,7 @@ def write(folder, kind, names):
     else:
         cameras = [
             {
-                **{"name": name, "resolution": [WIDTH, HEIGHT], "K": K, "type": "hd"},
+                **{"name": name, "resolution": [WIDTH, HEIGHT], "K": K.tolist(), "type": "hd"},
                 **{"distCoef": [*DISTORTION.values(), 0.0], "R": r.tolist(), "t": t.tolist()},
             }
             for name, r, t in each
@@ -126,7 +128,7 @@ def test_cameras_without_frames_are_told_of(tmp_path, kind):
         path for path in (tmp_path / names[2], *tmp_path.glob(f"*/{names[2]}")) if path.is_dir()
     )
     place.rename(place.with_name("other"))
-    with told(f"1 of 4 cameras have no video or folder .* left out: {names[2]}"):
+    with told(f"4 cameras have no video or folder .* left out: {names[2]}|no camera of other"):
         assert len(read(tmp_path).splits["train"]) == 9
 
 
@@ -147,10 +149,97 @@ def test_files_of_other_names_or_contents_are_no_calibrations(tmp_path):
         ("Panoptic", '"R"', '"rot"', r"dance.json cannot be read .*'R'.*transforms.json"),
         ("Panoptic", '"00_', '"01_', "none of its cameras has a video or a folder .*01_00"),
         ("Panoptic", '{"cam', '["cam', "dance.json cannot be read as the calibration"),
+        ("Panoptic", '"name": "00_00"', '"name": ["a"]', "dance.json cannot .*name is .'a'"),
+        ("EasyMocap's vectors", "K_02: !!opencv", "K_02: !other", r"extri.yml cannot .*'K', '02'"),
+        ("immersive", "-0.01]", "-0.01, 0.3]", r"camera_0000: .* after k2 are .*\[0.3\]. Undist"),
+        ("Panoptic", "0.0], ", "0.0, 0, 0, 0, 0.5], ", r"00_00: .* after k6 .*\[0.5\]"),
+        ("Panoptic", f'"K": [[{OPENCV[0]}, 0.0', f'"K": [[{OPENCV[0]}, 2.0', r"skew .*are \[2.0\]"),
     ],
 )
 def test_damaged_calibrations_are_refused_by_name(tmp_path, kind, old, new, words):
     build(tmp_path, kind)
-    for path in [*tmp_path.glob("extri.yml"), *tmp_path.glob("*.json")]:
+    for path in [*tmp_path.glob("*.yml"), *tmp_path.glob("*.json")]:
         path.write_text(path.read_text().replace(old, new))
     refused(partial(read, tmp_path), words)
+
+
+@pytest.mark.parametrize("content", ["[]", '{"cameras": []}'])
+def test_calibrations_without_cameras_are_refused(tmp_path, content):
+    build(tmp_path, "immersive")
+    (tmp_path / "models.json").write_text(content)
+    refused(partial(read, tmp_path), r"models.json cannot .*\(it holds no camera\). Export it")
+
+
+@pytest.mark.parametrize("name", ["models.json", "extri.yml", "calibration_a.json"])
+def test_folders_called_like_calibrations_are_none(tmp_path, name):
+    build(tmp_path, "Panoptic")
+    (tmp_path / "calibration_dance.json").unlink()
+    (tmp_path / name).mkdir()
+    assert not MultiCameraSettings.recognises(tmp_path)
+    refused(partial(read, tmp_path), "Add the calibration of the cameras")
+
+
+def test_calibrations_that_may_not_be_read_are_not_recognised(tmp_path, monkeypatch):
+    build(tmp_path, "immersive")
+    denied = Path.read_bytes
+
+    def read_bytes(path):
+        if path.name == "models.json":
+            raise PermissionError(13, "Permission denied")
+        return denied(path)
+
+    monkeypatch.setattr(Path, "read_bytes", read_bytes)
+    assert not MultiCameraSettings.recognises(tmp_path)
+    refused(partial(read, tmp_path), "models.json cannot be read .*Permission denied")
+
+
+@pytest.mark.parametrize("kind", ["EasyMocap's vectors", "Panoptic"])
+def test_folders_of_scenes_are_no_rig(tmp_path, kind):
+    for scene in "bac":
+        build(tmp_path / scene, kind)
+    assert not MultiCameraSettings.recognises(tmp_path)
+    refused(partial(read, tmp_path), "holds neither")
+    assert MultiCameraSettings.recognises(tmp_path / "a")
+
+
+def test_scenes_inside_another_are_not_mixed_with_it(tmp_path):
+    names = build(tmp_path, "EasyMocap's vectors")
+    (tmp_path / "images").rename(tmp_path / "views")
+    write(tmp_path / "images", "EasyMocap's vectors", names)
+    (tmp_path / "views/link").symlink_to("..")
+    for name in [*names, "07"]:
+        save(tmp_path / "images" / name / "0.jpg", picture(0))
+    with told(None):
+        assert len(read(tmp_path).splits["train"]) == 12
+
+
+def test_several_calibrations_of_panoptic_are_named(tmp_path):
+    build(tmp_path, "Panoptic")
+    (tmp_path / "calibration_a.json").write_text('{"cameras": []}')
+    refused(partial(read, tmp_path), "2 calibrations: calibration_a.json, calibration_dance.json")
+
+
+def test_recordings_without_a_calibration_are_told_of(tmp_path):
+    build(tmp_path, "EasyMocap's vectors")
+    save(tmp_path / "images/07/0.jpg", picture(0))
+    with told("extri.yml has no camera of 07. 1 are left out"):
+        assert len(read(tmp_path).splits["train"]) == 12
+
+
+def test_other_panels_of_panoptic_need_not_be_there(tmp_path):
+    build(tmp_path, "Panoptic")
+    path = tmp_path / "calibration_dance.json"
+    content = json.loads(path.read_text())
+    content["cameras"] += [{**content["cameras"][0], "name": "01_01", "type": "vga"}]
+    path.write_text(json.dumps(content))
+    with told(None):
+        assert len(read(tmp_path).splits["train"]) == 12
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-8"])
+def test_calibrations_may_have_comments_and_other_encodings(tmp_path, encoding):
+    build(tmp_path, "immersive")
+    path = tmp_path / "models.json"
+    path.write_bytes(f"// A comment\n{path.read_text()}".encode(encoding))
+    assert MultiCameraSettings.recognises(tmp_path)
+    assert len(read(tmp_path).splits["train"]) == 12

@@ -17,6 +17,7 @@ from tests.scenes.common import (
     refused,
     rgba,
     same,
+    told,
 )
 from xplanes.baselines.tineuvox.model import frusta_box
 from xplanes.preparation.fixed_view import check_camera
@@ -302,6 +303,27 @@ def test_a_frames_own_keys_go_before_the_files(tmp_path):
     found = scene.train().intrinsics
     torch.testing.assert_close(found.focal, torch.tensor(focal).double(), rtol=1e-6, atol=0)
     assert found.centre.tolist() == list(centre)
+
+
+@pytest.mark.parametrize(
+    ("shared", "frame", "focal"),
+    [
+        ({"fl_y": 33.0}, {"fl_x": 20.0}, [20, 33]),
+        ({"fl_x": 30.0, "camera_angle_y": 0.5}, {"fl_x": 20.0}, [20, 20]),
+        ({"fl_x": 30.0, "fl_y": 33.0, "camera_angle_y": 0.5}, {"fl_x": 20.0}, [20, 20]),
+        (
+            {"fl_x": 30.0, "fl_y": 33.0},
+            {"fl_x": 20.0, "camera_angle_y": 0.5},
+            [20, focal_length(0.5, 18)],
+        ),
+    ],
+)
+def test_the_focal_length_along_y_of_a_frame_with_one_along_x(tmp_path, shared, frame, focal):
+    shared = {"w": 12, "h": 18, **shared}
+    scene = SceneFolder(tmp_path).add("train", [(12, 18)], shared=shared, frames=[frame])
+    with told("pixels that are not square" if "camera_angle_y" in frame else None):
+        found = scene.train().intrinsics.focal[0].tolist()
+    assert found == pytest.approx(focal)
 
 
 def test_images_of_different_sizes_are_read(tmp_path):

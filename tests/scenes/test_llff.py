@@ -59,6 +59,19 @@ def test_captures_of_dynamic_scenes_have_the_times_in_their_names(folder):
     assert read(folder, static=True).splits["train"].times.tolist() != [0.0] * COUNT
 
 
+@pytest.mark.parametrize("changes", [{"static": False}, {}], ids=str)
+def test_numbers_of_cameras_are_times_of_dynamic_scenes(tmp_path, changes):
+    for index in range(4):
+        save(tmp_path / f"jump/images/cam{index:02d}.png", picture(index))
+    write_rows(tmp_path / "jump", poses(4), HEIGHT, WIDTH, 36.0)
+    if not changes:
+        (tmp_path / "jump/flow_i1").mkdir()
+    with pytest.warns(UserWarning, match="of cameras") as warned:
+        views = read(tmp_path / "jump", **changes).splits["train"]
+    assert views.times.tolist() == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    assert not any("time_pattern" in str(each.message) for each in warned)
+
+
 def test_models_of_colmap_beside_it_are_preferred(folder):
     """As Mip-NeRF 360's captures have them."""
     camera = {1: ("PINHOLE", 2 * WIDTH, 2 * HEIGHT, (70.0, 70.0, float(WIDTH), float(HEIGHT)))}

@@ -277,6 +277,64 @@ def test_masks_of_a_rig_are_no_cameras_and_told_of(images, mask, outer):
         require_all(read(images))
 
 
+@pytest.mark.parametrize("name", ["cam{:02d}/masked_{}.png", "masked_rig/cam{:02d}/{}.png"])
+def test_frames_whose_names_speak_of_masks_are_read(images, name):
+    for path in sorted(images.glob("cam*/*")):
+        new = images / name.format(int(path.parent.name[3:]), path.stem)
+        new.parent.mkdir(parents=True, exist_ok=True)
+        path.rename(new)
+        if "rig" in name and not [*path.parent.iterdir()]:
+            path.parent.rmdir()
+    with told(None):
+        require_all(read(images))
+
+
+@pytest.mark.parametrize("outer", ["normal_speed", "seg1"])
+@pytest.mark.parametrize("calibration", ["poses", "colmap"])
+def test_folders_of_cameras_may_be_called_like_other_kinds(images, outer, calibration):
+    move(images, outer)
+    if calibration == "colmap":
+        (images / "poses_bounds.npy").unlink()
+        with_colmap(images, "cam{:02d}.png")
+    require_recognised(images)
+    require_all(read(images))
+
+
+@pytest.mark.parametrize("empty", ["", None])
+def test_frames_of_a_rig_without_a_file_are_left_out(images, empty):
+    (images / "poses_bounds.npy").unlink()
+    with_transforms(images, "cam{:02d}")
+    content = json.loads((images / "transforms.json").read_text())
+    content["frames"].insert(1, {**content["frames"][0], "file_path": empty})
+    (images / "transforms.json").write_text(json.dumps(content))
+    require_recognised(images)
+    with told("1 of 5 frames are left out:\n.*frame 1 "):
+        require_all(read(images))
+
+
+def test_videos_of_masks_belong_to_no_row_or_registered_image(copied):
+    for camera in range(CAMERAS):
+        (copied / f"cam{camera:02d}.mp4").rename(copied / f"GX{camera}.mp4")
+        (copied / f"GX{camera}_mask.mp4").write_bytes(b"")
+    require_recognised(copied)
+    with told("GX0_mask.mp4, .* is not read"):
+        read(copied, test_cameras=["GX0"])
+    for path in copied.glob("GX*"):
+        path.rename(copied / path.name.replace("GX", "cam0"))
+    (copied / "poses_bounds.npy").unlink()
+    with_colmap(copied, "cam{:02d}.png")
+    require_recognised(copied)
+    with told("cam00_mask.mp4, .* is not read"):
+        read(copied)
+
+
+def test_images_extracted_beside_loose_videos_are_no_cameras(copied):
+    save(copied / "frames" / "0.png", rgb(0)[0])
+    for camera in range(CAMERAS):
+        (copied / f"cam{camera:02d}.mp4").rename(copied / f"GX{camera}.mp4")
+    assert not MultiCameraSettings.recognises(copied)
+
+
 @pytest.mark.parametrize("names", ["Camera Camera.001 Camera.002", "cam cam2", "cam_left cam_top2"])
 def test_some_cameras_have_no_number(tmp_path, names):
     for name in names.split():
@@ -296,13 +354,21 @@ def test_cameras_may_have_an_image_of_another_kind(images):
 
 
 @pytest.mark.parametrize(
-    "other", ["{}_mask.png", "depth_{:05d}.png", "segmentation_{}.png", "{}.jpg", "background.png"]
+    "other",
+    [
+        "{}_mask.png",
+        "{}.masked.png",
+        "depth_{:05d}.png",
+        "segmentation_{}.png",
+        "{}.jpg",
+        "background.png",
+    ],
 )
 def test_images_of_other_kinds_beside_frames_are_left_out(images, other):
     for camera in range(CAMERAS):
         for number in range(5, 5 + FRAMES):
             save(images / f"cam{camera:02d}" / other.format(number), rgb(camera)[0] // 2)
-    mask = "cam00/10_mask.png, .* is not read.*alpha channel of the cameras' images"
+    mask = r"cam00/10[_.]mask(ed)?.png, .* is not read.*alpha channel of the cameras' images"
     with told(mask if "mask" in other else "no frames beside 5."):
         found = read(images)
     require_rays_of(found.splits["test"], list(range(FRAMES)))
@@ -379,6 +445,38 @@ def test_images_of_nearly_equal_times_are_simultaneous(images, kind, gone):
         assert sorted({*views.times.tolist()}) == pytest.approx(times, abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        lambda camera, number: f"take_1.{998 + number}",
+        lambda camera, number: f"{camera}.{98 + number}",
+        lambda camera, number: f"{1 if camera == 1 else camera + 7}.{1 + number:04d}",
+        lambda camera, number: f"{1700000000 + number / 30 + camera * 1e-6:.6f}",
+        # A burst in one camera.
+        lambda camera, number: f"I_20260102_1159{50 + number}{'_1' * (camera == number == 2)}",
+    ],
+)
+def test_numbers_of_takes_and_cameras_are_no_seconds(images, name):
+    stamp(images, name)
+    with told(None):
+        require_all(read(images))
+
+
+@pytest.mark.parametrize("late", [(0, 11, -11, 0), (0, 5, -5, 0)])
+def test_limits_of_time_hold_between_all_cameras(images, late):
+    stamp(images, lambda camera, number: f"{1700000000000 + 40 * number + late[camera]}")
+    if late[1] == 11:  # 22 is more than 0.3 of 40.
+        refuse(images, "that none are simultaneous")
+        return
+    with told(r"different cameras differ by up to 10, and those of one camera by 40\."):
+        require_all(read(images))
+
+
+def test_numbers_of_frames_must_be_equal(images):
+    stamp(images, lambda camera, number: f"{10 * number + camera % 3:05d}")
+    refuse(images, "no number is in the names of images of all cameras .*cam00/00000.png")
+
+
 @pytest.mark.parametrize("kind", ["between", "shifted"])
 def test_cameras_without_simultaneous_frames_are_refused(images, kind):
     late = 20 if kind == "between" else 14
@@ -401,6 +499,7 @@ def test_folders_of_single_views_are_no_cameras(tmp_path):
         ("cam{:02d}.jpg", False),
         ("cam{:02d}/0005.png", False),
         ("first frames/cam{:02d}.png", True),
+        (lambda camera: f"{'left' if camera < 2 else 'right'}/cam{camera:02d}.png", False),
     ],
 )
 def test_colmap_may_have_registered_an_image_of_each_camera(images, name, text):

@@ -39,10 +39,6 @@ from xplanes.scenes.name_times import times_in_names
         ("clip_1_1080p clip_2_1080p clip_5_1080p", [0, 0.25, 1]),
         ("12345678_200001 12345678_200002 12345678_200005", [0, 0.25, 1]),
         ("C0001 C0002 C0005", [0, 0.25, 1]),
-        (
-            " ".join(f"{time:04d}_{camera:02d}" for time in (0, 1, 2, 4) for camera in range(3)),
-            [time / 4 for time in (0, 1, 2, 4) for _ in range(3)],
-        ),
         ("left_001 left_002 left_005 right_001 right_002 right_005", [0, 0.25, 1] * 2),
         ("20260102_115959 20260102_115959(1) 20260102_115959(3)", [0, 0.5, 1]),
         ("f_000 f_001 f_001(7) f_004", [0, 0.25, 0.25, 1]),
@@ -80,6 +76,16 @@ def test_names_tell_times(names, times):
         ([f"frame{i:05d}/{j:02d}.png" for i in range(4) for j in range(2)], "taken for cameras"),
         ([f"{i:03d}/{j:02d}.png" for i in range(4) for j in range(3)], "taken for cameras"),
         (["t_-2.png", "t_1.png", "t_2.png"], "-2"),
+        ([f"view_{i:03d}.png" for i in range(120)], r"may be those of cameras .*view_001.png -> 1"),
+        ([f"V{i}.png" for i in range(100)], "may be those of cameras"),
+        ([f"V{i}.png" for i in range(101)], "may be those of cameras"),
+        ([f"{i // 10:02d}_{i % 10:04d}.png" for i in range(200)], "are only 20, for 200"),
+        ([f"{i // 20:04d}_{i % 20:02d}.png" for i in range(200)], "do not have the order"),
+        ([f"s{i // 10:02d}_f{i % 10:04d}.png" for i in range(200)], "are only 20, for 200"),
+        ([f"pos{i // 3}_shot{i % 3}.png" for i in range(36)], "are only 12, for 36"),
+        ([f"IMG_{i // 3:04d}_{i % 3}.png" for i in range(36)], "are only 12, for 36"),
+        ([f"az{i // 3:03d}_el{i % 3:02d}.png" for i in range(36)], "are only 12, for 36"),
+        ([f"{kind}_{i:03d}.png" for kind in ("walk", "run") for i in range(9)], "not have the ord"),
     ],
 )
 def test_times_that_are_hardly_those_of_the_images_are_shown(names, words):
@@ -102,3 +108,9 @@ def test_times_that_are_hardly_those_of_the_images_are_shown(names, words):
 def test_names_without_an_order_are_one_timestep(names, words):
     with pytest.warns(UserWarning, match=f"{words}(.|\n)*one timestep.*data.static=true"):
         assert times_in_names([f"{name}.png" for name in names.split()]) == []
+
+
+@pytest.mark.parametrize("name", ["cam_{:03d}", "Camera_{}", "lens{:02d}", "v{:02d}", "c{}"])
+def test_numbers_of_cameras_are_times_if_the_scene_changes(name):
+    with pytest.warns(UserWarning, match="may be those of cameras"):
+        assert times_in_names([f"{name.format(i)}.png" for i in range(9)], True) == [*range(9)]

@@ -185,6 +185,12 @@ def test_dates_are_times(capture, zone):
     assert capture.all().times.tolist() == pytest.approx([number / 9 for number in range(10)])
 
 
+@pytest.mark.parametrize("number", [0, 0.5, 1700000000])
+def test_dates_and_numbers_are_not_mixed(capture, number):
+    capture.timed([number] + [f"2026-01-02T11:59:{50 + index}Z" for index in range(9)])
+    capture.refused("frame 1 .*time is '2026-01-02T11:59:50Z'; it must be .*, or all dates")
+
+
 def test_times_from_0_to_1_stay(capture, caplog):
     capture.timed([0.1 + i / 20 for i in range(10)])
     with caplog.at_level(logging.INFO, logger="xplanes"):
@@ -727,8 +733,9 @@ def test_frames_without_a_name_are_left_out(capture, name):
         assert len(capture.all()) == 9
 
 
-def test_names_that_leave_the_folder_do_not_stand_for_images_inside(capture):
-    capture.change_each(file_path=lambda name: f"../{name}")
+@pytest.mark.parametrize("ending", [".png", ""])
+def test_names_that_leave_the_folder_do_not_stand_for_images_inside(capture, ending):
+    capture.change_each(file_path=lambda name: f"../{name.removesuffix('.png')}{ending}")
     assert len(capture.all()) == 10
     for index in range(10):
         save(capture.path.parent / f"images/frame_{index:05d}.png", disc())

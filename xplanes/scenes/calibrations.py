@@ -3,28 +3,30 @@
 All three give rotations and translations from the world to cameras with OpenCV's axes.
 """
 
-import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from xplanes.errors import SceneError
-from xplanes.scenes.entries import checked_pose, decoded, reading
+from xplanes.scenes.entries import checked_pose, decoded, parsed, reading, short, some
 from xplanes.scenes.listing import Calibration
 from xplanes.scenes.transforms import read_calibration
 
-FILES = ("extri.yml", "*/extri.yml", "models.json", "calibration_*.json", "*/calibration_*.json")
+FILES = ("extri.yml", "models.json", "calibration_*.json", "*/extri.yml", "*/calibration_*.json")
 """Files of EasyMocap (with intri.yml beside it), of immersive videos and of CMU Panoptic."""
 
 MATRIX = re.compile(
-    r"^([A-Za-z]+)_(\S+?)\s*:\s*!!opencv-matrix\s+rows:\s*(\d+)\s+cols:\s*(\d+)\s+dt:\s*\w+\s+"
-    r"data:\s*\[([^\]]*)\]|^([HW])_(\S+?)\s*:\s*([\d.]+)\s*$",
+    r"^([A-Za-z]+)_([^:\n]+?)\s*:\s*!!opencv-matrix\s+rows:\s*(\d+)\s+cols:\s*(\d+)\s+dt:\s*\w+\s+"
+    r"data:\s*\[([^\]]*)\]|^([HW])_([^:\n]+?)\s*:\s*([\d.]+)\s*$",
     re.M,
 )
 """A matrix, or a height or width, in a YAML file of OpenCV."""
+
+OWNER = re.compile(r"^(?:K|Rot|R|T)_([^:\n]+?)\s*:", re.M)
+"""The name of a camera, at the beginning of one of its matrices."""
 
 Camera = tuple[str, Any, Any, dict[str, Any]]
 """Name, rotation and translation from the world, and keys as of a transforms file."""
@@ -32,10 +34,17 @@ Camera = tuple[str, Any, Any, dict[str, Any]]
 BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's order of coefficients of perspective lenses."""
 
+NONE = 1e-6
+"""Skew and coefficients of distortion up to this stand for none."""
 
-def find_calibration(folder: Path) -> Path | None:
-    """The file of a calibration in a folder or, for some formats, in one inside."""
-    return next((path for pattern in FILES for path in sorted(folder.glob(pattern))), None)
+
+def find_calibration(folder: Path, patterns: Sequence[str] = FILES) -> Path | None:
+    """The file of a calibration in a folder or, for some formats, in the only one inside."""
+    for pattern in patterns:
+        found = sorted(path for path in folder.glob(pattern) if path.is_file())
+        if len({path.parent for path in found}) == 1:  # Several folders are as many scenes.
+            return found[0]
+    return None
 
 
 def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibration]]:
@@ -45,14 +54,20 @@ def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibratio
         path: Result of `find_calibration`.
 
     Raises:
-        SceneError: If the file is not such a calibration.
+        SceneError: If the file is not such a calibration, or if it is one of several.
     """
     advice = "Export it again, or write a transforms.json with a frame of each camera."
-    cameras = []
+    cameras, rivals = [], sorted(each.name for each in path.parent.glob("calibration_*.json"))
+    if path.name in rivals[:1] and len(rivals) > 1:
+        raise SceneError(
+            f"{path.parent} holds {len(rivals)} calibrations: {some(rivals)}. Keep only one there."
+        )
     with reading(path, "as the calibration of cameras", advice):
         try:
             read = _easymocap if path.suffix == ".yml" else _in_json
             for name, rotation, shift, keys in read(path, decoded(path.read_bytes())):
+                if not isinstance(name, str):
+                    raise TypeError(f"name is {short(name)}")
                 label, turn = f"{path}: {name}", np.array(rotation, dtype=np.float64)
                 turn = turn if turn.size == 9 else _rotation(turn.ravel())
                 pose = np.eye(4)
@@ -62,6 +77,8 @@ def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibratio
                 cameras.append((name, label, checked_pose(label, pose, "the pose"), calibration))
         except (LookupError, TypeError) as problem:
             raise ValueError(f"an entry is missing or of another kind: {problem}") from problem
+        if not cameras:
+            raise ValueError("it holds no camera")
     return cameras
 
 
@@ -73,39 +90,52 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
 
 
-def _lens(matrix: Any, distortion: Any) -> dict[str, Any]:
-    """Keys of a transforms file for a matrix of intrinsics and OpenCV's coefficients."""
-    given = zip(BROWN, np.array(distortion, dtype=np.float64).ravel().tolist(), strict=False)
-    (fl_x, _, cx), (_, fl_y, cy), _ = np.array(matrix, dtype=np.float64).tolist()
-    sides = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy}
-    return {"camera_model": "FULL_OPENCV", **sides, **dict(given)}
+def _lens(label: str, matrix: Any, distortion: Any, corner: float = 0) -> dict[str, Any]:
+    """Keys of a transforms file for OpenCV's intrinsics, and the place of its origin."""
+    (fl_x, skew, cx), (_, fl_y, cy), _ = np.array(matrix, dtype=np.float64).tolist()
+    sides = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx + corner, "cy": cy + corner}
+    lens = _coefficients(label, BROWN, distortion, skew)
+    return {"camera_model": "FULL_OPENCV", **sides, **lens}
+
+
+def _coefficients(
+    label: str, names: Sequence[str], values: Any, skew: float = 0
+) -> dict[str, float]:
+    """Coefficients of distortion by name; refuses others, and skew."""
+    found = np.array(values, dtype=np.float64).ravel().tolist()
+    if lost := [value for value in (skew, *found[len(names) :]) if abs(value) > NONE]:
+        raise SceneError(
+            f"{label}: skew or coefficients after {names[-1]} are not read, but are {short(lost)}. "
+            "Undistort the images, or calibrate without them."
+        )
+    return dict(zip(names, found, strict=False))
 
 
 def _easymocap(path: Path, content: str) -> Iterable[Camera]:
     found: dict[tuple[str, str], Any] = {}
-    for text in (content, decoded(path.with_name("intri.yml").read_bytes())):
-        for kind, name, rows, columns, data, side, owner, length in MATRIX.findall(text):
-            if side:
-                found[side, owner] = float(length)
-            else:
-                values = [float(number) for number in re.split(r"[,\s]+", data.strip(", \r\n"))]
-                found[kind, name] = np.reshape(values, (int(rows), int(columns)))
-    names = [name for kind, name in found if kind == "K"]
-    if not names:
-        raise SceneError(f"{path.with_name('intri.yml')} has no matrix K_NAME of a camera.")
-    for name in names:
+    text = f"{content}\n{decoded(path.with_name('intri.yml').read_bytes())}"
+    for kind, name, rows, columns, data, side, owner, length in MATRIX.findall(text):
+        if side:
+            found[side, owner] = float(length)
+        else:
+            values = [float(number) for number in re.split(r"[,\s]+", data.strip(", \r\n"))]
+            found[kind, name] = np.reshape(values, (int(rows), int(columns)))
+    for name in dict.fromkeys(OWNER.findall(text)):
         rotation = found["Rot", name] if ("Rot", name) in found else found["R", name]
         distortion = found.get(("dist", name), found.get(("D", name), []))
         size = {key.lower(): found[key, name] for key in "WH" if (key, name) in found}
-        yield name, rotation, found["T", name], _lens(found["K", name], distortion) | size
+        label = f"{path.with_name('intri.yml')}: {name}"
+        # Pixel centres are at whole numbers in OpenCV.
+        lens = _lens(label, found["K", name], distortion, corner=0.5)
+        yield name, rotation, found["T", name], lens | size
 
 
 def _in_json(path: Path, content: str) -> Iterable[Camera]:
-    cameras = json.loads(content)
+    cameras = parsed(content)
     if isinstance(cameras, dict):  # Of CMU Panoptic.
         for camera in cameras["cameras"]:
             size = dict(zip("wh", camera["resolution"], strict=True))
-            lens = _lens(camera["K"], camera["distCoef"])
+            lens = _lens(f"{path}: {camera['name']}", camera["K"], camera["distCoef"])
             yield camera["name"], camera["R"], camera["t"], lens | size
         return
     for camera in cameras:
@@ -117,6 +147,7 @@ def _in_json(path: Path, content: str) -> Iterable[Camera]:
         (cx, cy), focal = camera["principal_point"], camera["focal_length"]
         keys = {"camera_model": "OPENCV_FISHEYE", "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy}
         keys |= {"w": camera["width"], "h": camera["height"]}
-        keys |= dict(zip(("k1", "k2"), camera["radial_distortion"], strict=False))
+        label = f"{path}: {camera['name']}"
+        keys |= _coefficients(label, ("k1", "k2"), camera["radial_distortion"])
         rotation = _rotation(np.array(camera["orientation"], dtype=np.float64))
         yield camera["name"], rotation, -rotation @ np.array(camera["position"]), keys

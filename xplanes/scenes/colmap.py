@@ -188,8 +188,9 @@ class ColmapSettings(CaptureSettings):
             pattern = self.time_pattern
             if (self.static, pattern) == (None, None) and self._as_llff:
                 return [], STATIC
-            found = times_in_names(names) if pattern is None else _matched(names, labels, pattern)
-            if not found:
+            if pattern is not None:
+                found = _matched(names, labels, pattern)
+            elif not (found := times_in_names(names, dynamic=self.static is False)):
                 return [], ""
             origin = "the numbers in their names"
         elif self.times == "rank":

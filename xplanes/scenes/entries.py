@@ -200,7 +200,9 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
     elif not PureWindowsPath(name).anchor:
         # The file of the cameras may have been moved up, out of a folder beside the images.
         inner = PurePosixPath(spelt(name).replace("../", ""))
-        if whole.exists() or not any((folder / f"{inner}{suffix}").exists() for suffix in SUFFIXES):
+        places = (whole, folder / inner)
+        there = [any(Path(f"{place}{end}").exists() for end in SUFFIXES) for place in places]
+        if there != [False, True]:
             raise SceneError(
                 f"{label}: {key} leaves the scene's folder {folder} (it is {name}). Put its files "
                 f"inside the folder and correct {key}."
@@ -265,7 +267,7 @@ def read_object(path: Path, content: str) -> dict[str, Any]:
         SceneError: If it cannot be read, or is not an object.
     """
     with reading(path, "as JSON", "Export or download it again."):
-        found = _parsed(_text(path))
+        found = parsed(_text(path))
     if not isinstance(found, dict):
         raise SceneError(f"{path} must hold a JSON object with {content}, not {short(found)}.")
     return found
@@ -281,7 +283,7 @@ def _text(path: Path) -> str:
         return content.decode("latin-1")
 
 
-def _parsed(text: str) -> Any:
+def parsed(text: str) -> Any:
     """Parse JSON that may have comments and trailing commas."""
     try:
         return json.loads(text)

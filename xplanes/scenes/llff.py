@@ -17,6 +17,11 @@ from xplanes.scenes.rigs import POSES, STATIC, is_dynamic, read_poses_bounds, re
 from xplanes.scenes.source import CaptureSettings
 from xplanes.scenes.views import Scene
 
+OTHER_TIMES = (
+    "Rename the images by their times, in the order of the rows, or, for a static scene, set "
+    "data.static=true."
+)
+
 
 @dataclass(frozen=True, kw_only=True)
 class LlffSettings(CaptureSettings):
@@ -42,7 +47,7 @@ class LlffSettings(CaptureSettings):
         names = [image.name for image in images]
         labels, poses, calibrations = zip(*read_poses_bounds(path, names), strict=True)
         dynamic = self.static is False or is_dynamic(self.folder)
-        times = times_in_names(names) if dynamic else []
+        times = times_in_names(names, True, OTHER_TIMES) if dynamic else []
         listing = Listing.checked(
             path,
             labels,

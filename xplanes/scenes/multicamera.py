@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
 
@@ -50,6 +51,9 @@ MOST_DRIFT = 0.5
 
 NEAR = 0.3
 """A larger difference between times of images, in intervals, is one between timesteps."""
+
+FIRST_CLOCK, LONG = 10**5, 10**8
+"""Least whole numbers that may be of clocks rather than frames, and least seconds that are."""
 
 LATE = 1.5
 """A longer gap between frames, relative to the median gap, indicates a variable frame rate."""
@@ -111,9 +115,10 @@ class MultiCameraSettings(SceneSettings):
                     "cameras to score with data.test_cameras=[NAME], or leave data.eval_split out."
                 )
         watched = _video_camera(cameras, parts, self.video_camera)
-        recordings = _simultaneous([_recording(camera) for camera in cameras])
-        seen = [(recording.images or [recording.camera.source])[0] for recording in recordings]
+        found = [_recording(camera) for camera in cameras]
+        seen = [path for each in found for path in each.images or [each.camera.source]]
         warn_of_masks(folder, seen, "put them into the alpha channel of the cameras' images")
+        recordings = _simultaneous(found)
         poses = torch.from_numpy(np.stack([camera.pose for camera in cameras]))
         poses[:, :3, 3] -= torch.from_numpy(origin_near(folder, poses[:, :3, 3].numpy()))
         images = [image for recording in recordings for image in recording.images[:1]]
@@ -273,36 +278,32 @@ def _are_stamped(recordings: Sequence[Recording]) -> bool:
 def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
     """The recordings, without images of timesteps that some cameras lack; warns about these images.
 
-    Images of equal numbers are simultaneous, or of the nearest ones, as clocks of cameras differ.
+    Images of equal numbers are simultaneous; of clocks, which differ, those of the nearest ones.
     If the cameras' numbers do not overlap, they are counted from the first of each camera. Those of
     the first camera become the images' times, as all cameras may lack the same ones.
 
     Raises:
         SceneError: If images are missing, and other cameras have videos.
     """
-    numbers = {
-        camera: found
-        for camera, recording in enumerate(recordings)
-        if recording.images and (found := _numbers(recording.images))
-    }
+    numbers = _numbers(recordings)
     each = list(numbers.values())
     if not each or any(len({*own}) < len(own) for own in each):
         return list(recordings)
+    clocks = all(isinstance(own[0], float) or min(own) >= FIRST_CLOCK for own in each)
     if max(own[0] for own in each) > min(own[-1] for own in each):
         numbers = {camera: [n - own[0] for n in own] for camera, own in numbers.items()}
     folder = recordings[0].camera.source.parent
-    partners, apart, step = _partners(list(numbers.values()))
-    common = np.flatnonzero((partners >= 0).all(axis=0)).tolist()
-    if not common:
+    partners, apart, step = _partners(list(numbers.values()), clocks)
+    if not partners.size:
         pairs = [(camera, recordings[camera].images[0]) for camera in numbers]
         shown = some([f"{recordings[camera].camera.name}/{path.name}" for camera, path in pairs])
         raise SceneError(
-            f"{folder}: no number is in the names of images of all cameras ({shown}), nor do the "
-            f"nearest differ by less than {NEAR:g} of the interval between images, so that none "
+            f"{folder}: no number is in the names of images of all cameras ({shown}), nor do those "
+            f"of clocks differ by less than {NEAR:g} of the interval between images, so that none "
             "are simultaneous. Number simultaneous images alike."
         )
     chosen = [
-        tuple(recordings[camera].images[place] for place in found[common])
+        tuple(recordings[camera].images[place] for place in found)
         for camera, found in zip(numbers, partners, strict=True)
     ]
     lost = {
@@ -318,7 +319,7 @@ def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
         if len(numbers) < len(recordings):
             raise SceneError(f"{text}. Add what is missing, or extract the images of all videos.")
         warn(f"{text}. {len(lost)} images are left out.")
-    if apart:
+    if apart > 1e-3 * step:  # Or else times are rounded.
         warn(
             f"{folder}: images of the nearest numbers are taken to be simultaneous, as those of "
             f"different cameras differ by up to {apart:.3g}, and those of one camera by "
@@ -328,19 +329,25 @@ def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
         for camera, own in numbers.items():
             _warn_of_gaps(recordings[camera], own)
         return list(recordings)
-    shared = tuple(next(iter(numbers.values()))[place] for place in common)
+    shared = tuple(next(iter(numbers.values()))[place] for place in partners[0])
     timed = isinstance(shared[0], float)  # Of clocks.
     times = [shared if timed or _are_series(images) else () for images in chosen]
     return [
-        replace(recording, count=len(common), images=images, times=own)
+        replace(recording, count=len(shared), images=images, times=own)
         for recording, images, own in zip(recordings, chosen, times, strict=True)
     ]
 
 
-def _numbers(images: Sequence[Path]) -> list[Number]:
-    """Times of clocks in the images' names, as floats, if they differ; else whole numbers."""
-    times = times_of_clocks([path.name for path in images])
-    return times if len({*times}) == len(images) else most_different([p.stem for p in images])
+def _numbers(recordings: Sequence[Recording]) -> dict[int, list[Number]]:
+    """Of each camera with images, their times, floats, if all have clocks; else whole numbers."""
+    named = [(camera, each.images) for camera, each in enumerate(recordings) if each.images]
+    times = {camera: times_of_clocks([path.name for path in own]) for camera, own in named}
+    # Clocks run on; the numbers of a take and a frame, as in 1.998 and 1.999, are none.
+    rising = all(own and all(one < other for one, other in pairwise(own)) for own in times.values())
+    if rising and all(own[0] >= LONG or int(own[0]) < int(own[-1]) for own in times.values()):
+        return times
+    found = {camera: most_different([path.stem for path in own]) for camera, own in named}
+    return {camera: numbers for camera, numbers in found.items() if numbers}
 
 
 def _counts(recordings: Sequence[Recording]) -> str:
@@ -352,27 +359,28 @@ def _counts(recordings: Sequence[Recording]) -> str:
     return f" ({each})" if len(cameras) > 1 else ""
 
 
-def _partners(each: Sequence[Sequence[Number]]) -> tuple[np.ndarray, float, float]:
-    """The images of each camera that are simultaneous with those of the first.
+def _partners(each: Sequence[Sequence[Number]], nearest: bool) -> tuple[np.ndarray, float, float]:
+    """The images of all cameras that are simultaneous.
 
     Args:
         each: Numbers of each camera's images. [C]
+        nearest: Whether numbers may differ, as those of clocks do.
 
     Returns:
-        Indices of the images, -1 if there is none, int64 [C, N]; the largest difference between
-        their numbers; and the shortest of the cameras' median intervals.
+        Indices of the images of each timestep, int64 [C, T]; the largest difference between their
+        numbers; and the shortest of the cameras' median intervals.
     """
     # Subtracted before conversion to float, which cannot represent clocks in nanoseconds exactly.
     series = [np.array([number - each[0][0] for number in own], dtype=np.float64) for own in each]
     step = min(float(np.median(np.diff(np.sort(own)))) if len(own) > 1 else 1.0 for own in series)
-    first, found, apart = series[0], [], 0.0
-    for own in series:
-        places = _nearest(own, first)
-        gaps = np.abs(own[places] - first)
-        kept = (gaps < NEAR * step) & (_nearest(first, own[places]) == np.arange(len(first)))
-        found.append(np.where(kept, places, -1))
-        apart = max(apart, *gaps[kept].tolist(), 0.0)
-    return np.stack(found), apart, step
+    first, order = series[0], np.arange(len(series[0]))
+    places = np.stack([_nearest(own, first) for own in series])
+    found = np.stack([own[place] for own, place in zip(series, places, strict=True)])
+    apart = np.ptp(found, axis=0)
+    kept = (apart < NEAR * step) if nearest else (apart == 0)
+    for own in found:
+        kept &= _nearest(first, own) == order
+    return places[:, kept], float(apart[kept].max(initial=0)), step
 
 
 def _nearest(values: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -1,6 +1,5 @@
 """Times of images from the numbers in their names."""
 
-import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Sequence
@@ -30,8 +29,16 @@ CAMERA = re.compile(
 CLIP = re.compile(r"(?i)[cv]\d{3,}")
 """The number of a clip or a frame rather than of a camera."""
 
-MOST_DIGITS = 3
-"""Digits of a camera's number; longer ones may be those of frames, as in cam_0001."""
+SIDE = re.compile(
+    r"(?i)(?<![a-z])(left|right|top|bottom|front|back|rear|cent(er|re)|middle)(?![a-z])"
+)
+"""The name of a camera by its place, as in left_0001."""
+
+FRAME = re.compile(r"(?i)\d{4}|^[cv]\d{3}")
+"""A number that may be of a frame even after the word for a camera, as in cam_0001."""
+
+MOST_CAMERAS = 64
+"""Number of images up to which numbers of cameras are taken for these, as in cam00 to cam19."""
 
 CLOCK = re.compile(r"(?<![A-Za-z\d])\d+\.\d+(?=s?$)|(?<!\d)(\d{10})[_-](\d{9}|\d{6}|\d{3})$")
 """Seconds and their fraction at the end of a name, as in 1305031102.175304."""
@@ -57,7 +64,9 @@ NUMBER = r"(?:(?:(?<=[_ ])|^)-)?\d+"
 Number = int | float
 
 
-def times_in_names(names: Sequence[str]) -> list[Number]:
+def times_in_names(
+    names: Sequence[str], dynamic: bool = False, advice: str = OTHER_TIMES
+) -> list[Number]:
     """Times of images, in any unit, from their names; empty, with a warning, if there are none.
 
     Times are dates with the time of day, seconds with a fraction, or else the number that varies
@@ -66,9 +75,11 @@ def times_in_names(names: Sequence[str]) -> list[Number]:
 
     Args:
         names: Names of the images, with their folders. [V]
+        dynamic: Whether the scene is known to change, so that numbers of cameras may be times.
+        advice: How to give other times, for warnings.
     """
     if times := times_of_clocks(names):
-        return _checked(names, times)
+        return _checked(names, times, advice)
     stems = [PurePosixPath(name).stem for name in names]
     # If each folder is a timestep, file names are those of cameras.
     paths = [PurePosixPath(name).with_suffix("").as_posix() for name in names]
@@ -77,14 +88,18 @@ def times_in_names(names: Sequence[str]) -> list[Number]:
         found = most_different(texts)
         if len(set(found)) > 1 or (found and len(names) == 1):
             break
-    digits = _digits_of_cameras(stems) if texts is stems and len(names) > 1 else 0
+    cameras = _cameras(stems) if texts is stems and len(names) > 1 else []
+    few = len(names) <= MOST_CAMERAS and not any(map(FRAME.search, cameras))
     why = _no_series(names, stems, found)
-    if not why and 0 < digits <= MOST_DIGITS:
-        why = f"The numbers in the names of the images, such as {names[0]}, are those of cameras"
+    if not why and cameras and few and not dynamic:
+        why = (
+            f"The numbers in the names of the images, such as {names[0]}, are those of cameras "
+            "(data.static=false takes them for times)"
+        )
     if why:
-        warn(f"{why}: all images are taken for one timestep. {OTHER_TIMES}")
+        warn(f"{why}: all images are taken for one timestep. {advice}")
         return []
-    return _checked(names, found, by_file=texts is not whole, by_camera=digits > MOST_DIGITS)
+    return _checked(names, found, advice, by_file=texts is not whole, by_camera=bool(cameras))
 
 
 def times_of_clocks(names: Sequence[str]) -> list[Number]:
@@ -97,12 +112,10 @@ def times_of_clocks(names: Sequence[str]) -> list[Number]:
     return []
 
 
-def _digits_of_cameras(stems: Sequence[str]) -> int:
-    """The most digits of a camera's number in names; 0 if a name has none."""
-    found = [match[0] if (match := CAMERA.search(stem)) else "" for stem in stems]
-    if not all(found) or any(map(CLIP.fullmatch, found)):
-        return 0
-    return max(len(re.sub(r"\D", "", text)) for text in found)
+def _cameras(stems: Sequence[str]) -> list[str]:
+    """The camera in each name; empty if a name has none, or if all are clips."""
+    found = [match[0] for stem in stems if (match := CAMERA.search(stem))]
+    return [] if len(found) < len(stems) or all(map(CLIP.fullmatch, found)) else found
 
 
 def _dates(stems: Sequence[str]) -> list[float | None]:
@@ -179,53 +192,41 @@ def _no_series(names: Sequence[str], stems: Sequence[str], found: Sequence[Numbe
     return None
 
 
-def _is_grid(names: Sequence[str], times: Sequence[Number]) -> bool:
-    """Whether names differ in their time and in another part, a camera, with all pairs of both."""
-    rest = []
-    for name, time in zip(names, times, strict=True):
-        others = [int(number) for number in re.findall(NUMBER, name)]
-        if time in others:
-            others.remove(int(time))
-        rest.append((re.sub(r"\d+", "#", name), *sorted(others)))
-    pairs, counts = {*zip(rest, times, strict=True)}, (len({*rest}), len({*times}))
-    return min(counts) > 1 and len(pairs) == len(names) == math.prod(counts)
-
-
-def _folders(names: Sequence[str], times: Sequence[Number]) -> list[list[int]]:
+def _folders(names: Sequence[str]) -> list[list[int]]:
     """Indices of the images of each folder and camera, in the order of their names."""
     folders: dict[tuple[str, ...], list[int]] = defaultdict(list)
     paths = [PurePosixPath(name).with_suffix("") for name in names]
-    # Cameras may be called by letters, as in left_0001.
-    kinds = [re.sub(r"\d+", "#", path.name) for path in paths]
-    kinds = kinds if _is_grid(names, times) else [""] * len(names)
     bare = [natural(CAMERA.sub("", path.as_posix())) for path in paths]
     for place in sorted(range(len(names)), key=bare.__getitem__):
         path = paths[place]
-        cameras = (match[0] for match in CAMERA.finditer(path.name))
-        folders[path.parent.as_posix(), kinds[place], *cameras].append(place)
+        cameras = [match[0] for kind in (CAMERA, SIDE) for match in kind.finditer(path.name)]
+        folders[path.parent.as_posix(), *cameras].append(place)
     return list(folders.values())
 
 
 def _few(names: Sequence[str], times: Sequence[Number]) -> bool:
     """Whether there are far fewer times than images in a folder."""
-    if _is_grid(names, times):
-        return False
-    return len(set(times)) < FEW * max(map(len, _folders(names, times)))
+    return len(set(times)) < FEW * max(map(len, _folders(names)))
 
 
 def _checked(
-    names: Sequence[str], times: list[Number], by_file: bool = False, by_camera: bool = False
+    names: Sequence[str],
+    times: list[Number],
+    advice: str,
+    by_file: bool = False,
+    by_camera: bool = False,
 ) -> list[Number]:
     """The times; warns if they are implausible.
 
     Args:
         names: Names of the images. [V]
         times: Their times. [V]
+        advice: How to give others.
         by_file: Whether the times are numbers in the files' names, even if folders are timesteps.
         by_camera: Whether they follow the word for a camera.
     """
     why, shown = "may be those of cameras" if by_camera else "", list(range(min(3, len(names))))
-    for places in _folders(names, times):
+    for places in _folders(names):
         back = [pair for pair in pairwise(places) if times[pair[1]] < times[pair[0]]]
         if back:
             why, shown = "do not have the order of the names", [*back[0]]
@@ -245,5 +246,5 @@ def _checked(
         why = f"are those of the files, and the folders {found} are taken for cameras"
     if why:
         pairs = ", ".join(f"{names[place]} -> {times[place]}" for place in shown)
-        warn(f"The times from the numbers in the names {why} ({pairs}). {OTHER_TIMES}")
+        warn(f"The times from the numbers in the names {why} ({pairs}). {advice}")
     return times

@@ -7,9 +7,11 @@ another program (`calibrations`).
 """
 
 import functools
+import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -19,9 +21,9 @@ import numpy as np
 from xplanes.errors import SceneError, warn
 from xplanes.files import natural
 from xplanes.scenes import videos
-from xplanes.scenes.calibrations import find_calibration, read_calibrations
+from xplanes.scenes.calibrations import FILES, find_calibration, read_calibrations
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, image_count, read_model
-from xplanes.scenes.entries import checked_pose, is_positive, paths_inside, reading, some
+from xplanes.scenes.entries import checked_pose, is_positive, paths_inside, reading, some, usable
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import Calibration
 from xplanes.scenes.masks import MASKS
@@ -138,8 +140,7 @@ def _named_apart(cameras: Sequence[Camera]) -> list[Camera]:
 
 def recordings_of_cameras(folder: Path) -> list[Path]:
     """Videos and folders called cam*, else those with numbers such as 00 or view_01, by name."""
-    inside = sorted(filter(_is_recording, folder.iterdir()))
-    inside = [path for path in inside if not OTHER_KINDS.search(camera_name(path))] or inside
+    inside = _colours(sorted(filter(_is_recording, folder.iterdir())))
     numbered = [path for path in inside if NUMBERED.fullmatch(camera_name(path))]
     named = [path for path in inside if CAMERAS.match(camera_name(path))]
     counted = [path for path in named if re.search(r"\d", camera_name(path))]
@@ -164,19 +165,22 @@ def are_registered(folder: Path) -> bool:
 
 def is_calibrated(folder: Path) -> bool:
     """Whether another program's calibration is the only one, and names two recordings or more."""
-    path = find_calibration(folder)
-    if path is None or any(folder.glob("transforms*.json")) or find_model(folder):
-        return False
-    text = path.read_text(encoding="utf-8", errors="replace")
-    names = _recordings_of_any_name(folder)
-    return sum(bool(re.search(rf'["_]{re.escape(name)}\b', text)) for name in names) > 1
+    with suppress(OSError):  # The user may not have access to some files.
+        path = find_calibration(folder)
+        if path and not (any(folder.glob("transforms*.json")) or find_model(folder)):
+            content = path.read_bytes()
+            text = content.decode(json.detect_encoding(content), "replace")
+            names = _recordings_of_any_name(folder, path)
+            return sum(bool(re.search(rf'["_]{re.escape(name)}\b', text)) for name in names) > 1
+    return False
 
 
-def _recordings_of_any_name(folder: Path) -> dict[str, Path]:
+def _recordings_of_any_name(folder: Path, calibration: Path) -> dict[str, Path]:
     """Videos, or else folders of images, in a folder or in one inside, by camera."""
-    inside = [path for path in folder.iterdir() if path.is_dir() and path.name[0] != "."]
-    places = [folder, *(path for path in inside if not OTHER_KINDS.search(path.name))]
-    found = [path for place in places for path in sorted(filter(_is_recording, place.iterdir()))]
+    inside = _colours(sorted(p for p in folder.iterdir() if p.is_dir() and _is_recording(p)))
+    # Other folders with a calibration are other scenes.
+    own = [p for p in inside if p == calibration.parent or not find_calibration(p, FILES[:3])]
+    found = [path for p in (folder, *own) for path in sorted(filter(_is_recording, p.iterdir()))]
     # EasyMocap extracts images from videos, and programs write folders of the same names.
     found.sort(key=lambda path: (path.is_file(), path.parent.name.lower() in IMAGES))
     return {camera_name(path).removeprefix("hd_"): path for path in found if _is_filled(path)}
@@ -188,8 +192,10 @@ def recordings_below(folder: Path, *others: str) -> list[Path]:
         return found
     others = (TIMESTEPS, *others)
     inside = [path for path in folder.iterdir() if path.is_dir() and path.name not in others]
-    inside = [path for path in inside if not OTHER_KINDS.search(path.name)]
     deeper = [paths for path in inside if (paths := recordings_of_cameras(path))]
+    kept = [paths for paths in deeper if not OTHER_KINDS.search(paths[0].parent.name)]
+    if kept or any((folder / name).is_dir() for name in others):
+        deeper = kept
     if len(deeper) > 1:  # Of videos and images extracted from them, videos are read.
         named = [paths for paths in deeper if paths[0].parent.name.lower() in IMAGES]
         deeper = [paths for paths in deeper if all(map(Path.is_file, paths))] or named
@@ -199,9 +205,14 @@ def recordings_below(folder: Path, *others: str) -> list[Path]:
 def recordings_of_rows(folder: Path) -> list[Path]:
     """Recordings with rows in poses_bounds.npy: of any name if there are only videos."""
     inside = sorted(path for path in folder.iterdir() if path.name[0] != ".")
-    loose = [path for path in inside if path.suffix.lower() in videos.SUFFIXES]
-    others = len(loose) < 2 or any(path.name.startswith("images") for path in inside)
-    return recordings_below(folder) or ([] if others else loose)
+    loose = _colours([path for path in inside if path.suffix.lower() in videos.SUFFIXES])
+    images = any(path.name.startswith("images") or path.name.lower() in IMAGES for path in inside)
+    return recordings_below(folder) or ([] if images or len(loose) < 2 else loose)
+
+
+def _colours(paths: Sequence[Path]) -> list[Path]:
+    """Recordings but for masks, depths and the like, if others remain."""
+    return [path for path in paths if not OTHER_KINDS.search(camera_name(path))] or [*paths]
 
 
 def is_rig(folder: Path) -> bool:
@@ -213,6 +224,8 @@ def is_rig(folder: Path) -> bool:
     sources: set[Path] = set()
     try:
         for frame in read_frames(folder / TRANSFORMS)["frames"]:
+            if frame["file_path"] in ("", None):
+                continue
             source = with_frames(_source("", folder.resolve(), frame["file_path"]))
             if source in sources:
                 return False
@@ -237,7 +250,7 @@ def _is_filled(path: Path) -> bool:
 
 
 def _is_recording(path: Path) -> bool:
-    return path.is_dir() or path.suffix.lower() in videos.SUFFIXES
+    return path.name[0] != "." and (path.is_dir() or path.suffix.lower() in videos.SUFFIXES)
 
 
 def _from_poses_bounds(folder: Path) -> list[Camera]:
@@ -304,9 +317,13 @@ def _from_transforms(folder: Path, content: Mapping[str, Any]) -> list[Camera]:
     path = folder / TRANSFORMS
     cameras: dict[Path, Camera] = {}
     content_of = functools.cache(with_frames)  # Many frames may be of one camera.
-    for index, frame in enumerate(content["frames"]):
+
+    def located(item: tuple[int, dict[str, Any]]) -> tuple[str, dict[str, Any], Path]:
+        index, frame = item
         label = f"{path}: frame {index} ({frame['file_path']})"
-        source = _source(label, folder.resolve(), frame["file_path"])
+        return label, frame, _source(label, folder.resolve(), frame["file_path"])
+
+    for label, frame, source in usable("frames", located, [*enumerate(content["frames"])]):
         pose = checked_pose(label, frame["transform_matrix"])
         if (other := cameras.get(content_of(source))) is not None:
             if np.abs(other.pose - pose).max() > SAME_POSE:
@@ -328,21 +345,13 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
     recordings = recordings_below(folder, "images")
     folder = recordings[0].parent if recordings else folder
     sources: dict[str, list[Path]] = defaultdict(list)
-    for path in sorted(folder.iterdir()):
-        if _is_recording(path):
-            sources[camera_name(path)].append(path)
+    for path in _colours(sorted(filter(_is_recording, folder.iterdir()))):
+        sources[camera_name(path)].append(path)
     # Other folders, such as images and sparse, need not be cameras.
     expected = {path for paths in sources.values() for path in paths if path.is_file()}
     expected = sorted(expected | set(recordings))
     sources |= _counted(model, recordings)
     owned: dict[Path, list[str]] = {path: [] for path in expected}
-    folders = Counter(PurePosixPath(name).parent for name in model.names)
-    if len(folders) > 1 and min(folders.values()) > 1:
-        raise SceneError(
-            f"{model.source} has several images of each camera, such as {some(model.names)}. Read "
-            "them all, at the times in their names, with data=colmap; data=multicamera reads the "
-            "frames of cameras of which one image is registered."
-        )
     cameras, problems = [], []
     for name, pose, calibration in zip(
         model.names, model.camera_to_world, model.calibrations, strict=True
@@ -368,6 +377,13 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
     for path, names in owned.items():
         if len(names) > 1 or camera_name(path) not in known:
             problems.append(f"{some(names) or 'no registered image'} belongs to {path.name}")
+    folders = Counter(PurePosixPath(name).parent for name in model.names)
+    if problems and len(folders) > 1 and min(folders.values()) > 1:
+        raise SceneError(
+            f"{model.source} has several images of each camera, such as {some(model.names)}. Read "
+            "them all, at the times in their names, with data=colmap; data=multicamera reads the "
+            "frames of cameras of which one image is registered."
+        )
     if problems:
         raise SceneError(
             f"{model.source}: {some(problems)}. One image of each camera must be registered, and "
@@ -382,7 +398,7 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
 
 def _from_calibration(folder: Path, path: Path) -> list[Camera]:
     """Those cameras of another program's calibration that have a recording."""
-    sources, cameras, lost = _recordings_of_any_name(folder), [], []
+    sources, cameras, lost = _recordings_of_any_name(folder, path), [], []
     for name, label, pose, calibration in read_calibrations(path):
         if (source := sources.get(name)) is None:
             lost.append(name)
@@ -392,6 +408,16 @@ def _from_calibration(folder: Path, path: Path) -> list[Camera]:
         raise SceneError(
             f"{path}: none of its cameras has a video or a folder of images of its name, such as "
             f"images/{lost[0]} or videos/{lost[0]}.mp4. Add them to {folder}."
+        )
+    if path.match("calibration_*"):  # Panels of CMU Panoptic are recorded, and fetched, as a whole.
+        panels = {camera.name.split("_")[0] for camera in cameras}
+        lost = [name for name in lost if name.split("_")[0] in panels]
+    read = {camera.source for camera in cameras}
+    others = [other for other in _colours([*sources.values()]) if other not in read]
+    if others := [other.name for other in others if other.parent in {own.parent for own in read}]:
+        warn(
+            f"{path} has no camera of {some(others)}. {len(others)} are left out: add their "
+            "calibration, or move them elsewhere."
         )
     if lost:
         warn(
@@ -459,6 +485,7 @@ def frames_in(folder: Path) -> list[Path]:
     """
     images = images_in(folder)
     kept = [path for path in images if not OTHER_KINDS.search(path.stem)] or images
+    kept = [path for path in kept if not MASKS.search(path.stem)] or kept
     kept = [path for path in kept if re.search(r"\d", path.stem)] or kept
     kept = list({path.stem: path for path in reversed(kept)}.values())[::-1]
     used = {*kept}

@@ -76,7 +76,7 @@ def warn_of_masks(folder: Path, images: Sequence[Path], advice: str = "") -> Non
     """
     folder, images = folder.resolve(), [path.resolve() for path in images]
     places = {path.parent for path in images}
-    used = {*images, *places}
+    used = {*images, *places, *(parent for place in places for parent in place.parents)}
     above = {place.parent for place in places if folder in place.parents}
     found = sorted(
         path

@@ -364,7 +364,7 @@ def _warn_of_two_focal_lengths(
     for frame, camera in zip(frames, cameras, strict=True):
         # The angle along y is often that of the sensor, which is higher than a landscape image.
         for axis, side in (("x", camera.w), ("y", camera.h)):
-            keys = frame.entry if f"fl_{axis}" in frame.entry else content
+            keys = frame.entry if {"fl_x", f"fl_{axis}"} & {*frame.entry} else content
             angle, focal = keys.get(f"camera_angle_{axis}"), getattr(camera, f"fl_{axis}")
             if not (side and focal and is_positive(angle) and angle < math.pi):
                 continue
@@ -434,10 +434,6 @@ def _standard(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
     for key in {*NUMBERS} & {*found}:
         if isinstance(found[key], str) and (number := number_in(found[key])) is not None:
             found[key] = number
-    for key in {*TIMES} & {*found}:
-        with suppress(TypeError, ValueError):  # Of numbers, and of other text.
-            date = datetime.fromisoformat(found[key])
-            found[key] = (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
     for key in {*FLAGS} & {*found}:
         if isinstance(found[key], str) and found[key].lower() in ("true", "false"):
             found[key] = found[key].lower() == "true"
@@ -492,7 +488,14 @@ def read_frames(path: Path) -> dict[str, Any]:
                 "OpenGL's (x right, y up, z backward). Convert transform_matrix, and remove the "
                 "key."
             )
-    return _standard(path, content) | {"frames": [_standard(path, each) for each in frames]}
+    frames = [_standard(path, each) for each in frames]
+    for key in TIMES:
+        timed = [frame for frame in frames if frame.get(key) is not None]
+        with suppress(TypeError, ValueError):  # If one has a number, or other text.
+            dates = [datetime.fromisoformat(frame[key]) for frame in timed]
+            for frame, date in zip(timed, dates, strict=True):
+                frame[key] = (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
+    return _standard(path, content) | {"frames": frames}
 
 
 def stated_up(content: Mapping[str, Any], orient: bool | None) -> tuple[bool | None, Tensor | None]:
@@ -527,7 +530,7 @@ def _times(
     key = _time_key([frame.entry for frame in frames])
     if frames[0].entry.get(key) is None:
         return [], ""
-    times = [checked_number(frame.label, key, frame.entry[key]) for frame in frames]
+    times = [checked_number(f.label, key, f.entry[key], more=", or all dates") for f in frames]
     names = [frame.entry["file_path"] for frame in frames]
     source = time_source(f'"{key}" of {path.name}', names, times)
     first, last = span or (min(times), max(times))
@@ -561,8 +564,10 @@ def read_calibration(
         # The frame's field of view replaces the file's focal lengths.
         shared = {key: value for key, value in shared.items() if key not in ("fl_x", "fl_y")}
         name, keys = label, frame
-    elif "fl_x" in own:
-        shared.pop("fl_y", None)  # As in instant-ngp, a frame's fl_x alone means square pixels.
+    elif "fl_x" in own and "fl_x" in shared:
+        # As in instant-ngp, a frame's fl_x alone means square pixels.
+        shared.pop("fl_y", None)
+        shared |= {} if "camera_angle_y" in frame else {"fl_y": own["fl_x"]}
     known = shared | own
     model, distortion = _lens(where, content, label, frame)
     bare = Calibration(model=model, distortion=distortion)

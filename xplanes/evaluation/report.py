@@ -250,7 +250,7 @@ def log_hparams(trainer: Trainer, experiment: Experiment, metrics: dict[str, Any
         "model": model.name,
         "resolution": getattr(model, "resolution", 0),
         "channels": getattr(model, "channels", 0),
-        "lrm": method.lrm.name,
+        "lrm": metrics["lrm"].get("name", method.lrm.name),  # What lrm=auto chose.
         "seed": method.seed,
         "learning_rate": getattr(model, "learning_rate", getattr(model, "plane_lr", 0.0)),
     }

@@ -131,8 +131,11 @@ class AutoInitialiser(LRMInitialiser):
                     "(preparation.fixed_view=video takes them all the same)"
                 )
             words = f"random initialisation: {words}"
-            return Initialisation(method.model, place.frame, description=words)
-        return super().initialise(method, place)
+            return Initialisation(
+                method.model, place.frame, description=words, lrm={"name": "none"}
+            )
+        found = super().initialise(method, place)
+        return replace(found, lrm=found.lrm | {"name": self.settings.model_name})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,16 +1,14 @@
 """Fine planes: as many texels as the images show, trained from their first step on, resumed."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from tests.balls import ball_scene, ball_views, swinging
+from tests.balls import ball_scene
 from tests.training.runs import UNSCORED, changed, gone_on, same_state, small_config
 from xplanes.models import x_planes
 from xplanes.models.initialisation import Method
-from xplanes.scenes.frame import cube_frame, pixels_across, pixels_of_detail
 from xplanes.training.module import RadianceModule
 
 FINE = ("model.fine.texels=40", "model.fine.start=2", "model.fine.channels=3")
@@ -29,14 +27,18 @@ def test_fine_planes_have_the_texels_that_the_images_show(pixels, texels):
     assert model.texels(pixels) == max(64, texels)
 
 
-def test_planes_do_not_follow_pixels_where_things_move_before_surroundings():
-    moving = ball_views(4, 0.4, centre=swinging(0.5, 1), size=20)
-    static = replace(moving, times=torch.zeros_like(moving.times))
-    frame = cube_frame(1.0, torch.zeros(3))
-    pixels = pixels_across(moving, frame)
-    assert pixels > 0
-    found = [pixels_of_detail(v, frame, s) for v in (moving, static) for s in (False, True)]
-    assert found == [pixels, 0, pixels, pixels]
+@pytest.mark.parametrize(
+    ("pixels", "texels"), [(0, 64), (200, 64), (320, 64), (400, 96), (480, 128), (4000, 128)]
+)
+def test_where_things_move_before_surroundings_only_time_planes_follow_pixels(pixels, texels):
+    model = settings("model.resolution=64")
+    assert model.texels_of_time(pixels) == 64
+    assert model.texels_of_time(pixels, True) == texels
+    assert (model.fine_texels(pixels, True), model.texels(pixels, True)) == (0, 64)
+    plain = settings("model.time_texels=null")
+    assert plain.texels_of_time(pixels, True) == plain.resolution
+    assert settings("model.time_texels=50").texels_of_time(pixels, True) == 50
+    assert settings("model.fine.texels=100").fine_texels(pixels, True) == 100
 
 
 def test_they_may_be_given_or_left_out():

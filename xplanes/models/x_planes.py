@@ -50,6 +50,9 @@ FINE_WARMUP = 100
 TEXELS_PER_PIXEL, TEXEL_STEP, MOST_TEXELS = 0.66, 32, 256
 """Fine planes with texels=auto: texels per image pixel, rounding step, and maximum of texels."""
 
+TIME_TEXELS_PER_PIXEL, MOST_TIME_TEXELS = 0.25, 128
+"""The same for time planes with time_texels=auto."""
+
 FINER = 2.0
 """With texels=auto, fine planes need at least this many times the texels of space planes."""
 
@@ -147,8 +150,10 @@ class XPlanesSettings(ModelSettings):
     # Rows along time. half: half the distinct times, as in K-Planes, or all if four or more views
     # show each; null: the same, but at least the LRM's timesteps.
     time_resolution: Count | Literal["half"] | None
-    # Texels of the time planes along space; null: as many as the space planes.
-    time_texels: Count | None
+    # Texels of the time planes along space. auto: as many as the space planes, or, in moving scenes
+    # with surroundings and without an LRM, one per four image pixels across the field's cube, up to
+    # 128, if these are more; null: as many as the space planes.
+    time_texels: Count | Literal["auto"] | None
     channels: Count  # Channels of each plane.
     fine: FineSettings | None  # Fine space planes; null: none.
     space_scale: Weight  # Standard deviation of randomly initialised space planes.
@@ -172,24 +177,24 @@ class XPlanesSettings(ModelSettings):
         decoder = replace(self.decoder, colour_bias=max(self.decoder.colour_bias, 2.0))
         return replace(self, loss=loss, decoder=decoder)
 
-    @property
-    def texels_of_time(self) -> int:
-        """Texels of the time planes along space."""
-        return self.time_texels or self.resolution
+    def texels_of_time(self, pixels: float = 0.0, moves_in_surroundings: bool = False) -> int:
+        """Texels of the time planes along space. Arguments as for `texels`."""
+        if isinstance(self.time_texels, int):
+            return self.time_texels
+        if self.time_texels is None or not moves_in_surroundings:
+            return self.resolution
+        texels = TEXEL_STEP * round(TIME_TEXELS_PER_PIXEL * pixels / TEXEL_STEP)
+        return max(self.resolution, min(texels, MOST_TIME_TEXELS))
 
-    def texels(self, pixels: float) -> int:
-        return max(self.resolution, self.fine_texels(pixels))
+    def texels(self, pixels: float, moves_in_surroundings: bool = False) -> int:
+        return max(self.resolution, self.fine_texels(pixels, moves_in_surroundings))
 
-    def fine_texels(self, pixels: float) -> int:
-        """Texels of the fine planes along each space axis; 0 for none.
-
-        Args:
-            pixels: Image pixels that a side of the field's cube covers; 0 if not known.
-        """
+    def fine_texels(self, pixels: float, moves_in_surroundings: bool = False) -> int:
+        """Texels of the fine planes along each space axis, or 0. Arguments as for `texels`."""
         if self.fine is None or self.fine.texels != "auto":
             return 0 if self.fine is None else int(self.fine.texels)
         texels = min(TEXEL_STEP * round(TEXELS_PER_PIXEL * pixels / TEXEL_STEP), MOST_TEXELS)
-        return 0 if texels < FINER * self.resolution else texels
+        return 0 if texels < FINER * self.resolution or moves_in_surroundings else texels
 
     def rows_of_time(self, times: Tensor, frames: int = 0) -> int:
         """Rows of the time planes.
@@ -203,7 +208,7 @@ class XPlanesSettings(ModelSettings):
         return max(time_rows(times), frames if self.time_resolution is None else 0)
 
     def random_planes(
-        self, plane_set: str, rows: int, generator: torch.Generator
+        self, plane_set: str, rows: int, time_texels: int, generator: torch.Generator
     ) -> dict[str, Tensor]:
         """Random planes with ``rows`` rows along time, see `fields.xplanes.random_planes`."""
         return random_planes(
@@ -211,7 +216,7 @@ class XPlanesSettings(ModelSettings):
             channels=self.channels,
             resolution=self.resolution,
             time_resolution=rows,
-            time_texels=self.texels_of_time,
+            time_texels=time_texels,
             space_scale=self.space_scale,
             time_scale=self.time_scale,
             generator=generator,
@@ -225,12 +230,14 @@ class XPlanesSettings(ModelSettings):
         plane_set = self.plane_set if site.moves else "three"
         background = None if self.background is None else self.background.build(site)
         generator = step_generator(site.seed, 0, Stream.INITIAL_FIELD)
+        seen = site.pixels, site.moves and site.surrounded
         planes: Mapping[str, Tensor]
         if initial is not None:
             planes = initial.planes
         else:
-            planes = self.random_planes(plane_set, self.rows_of_time(site.times), generator)
-        if self.fine is not None and (texels := self.fine_texels(site.pixels)):
+            rows, texels = self.rows_of_time(site.times), self.texels_of_time(*seen)
+            planes = self.random_planes(plane_set, rows, texels, generator)
+        if self.fine is not None and (texels := self.fine_texels(*seen)):
             zeros = torch.zeros(min(self.fine.channels, self.channels), texels, texels)
             planes = {**planes, **dict.fromkeys(FINE_PLANES, zeros)}
         options = self.decoder

@@ -176,7 +176,7 @@ def convert_stage(
             target,
             plane_set=model.plane_set,
             dynamic=dynamic,
-            resolution=model.texels_of_time,
+            resolution=model.texels_of_time(),
             time_resolution=rows,
             noise=config.noise,
             generator=step_generator(seed, 0, Stream.NOISE),
@@ -198,7 +198,7 @@ def convert_stage(
 
     rows = PLANE_SETS[model.plane_set]  # A user's own plane set may change without a new name.
     of_time = [config.dynamic, config.noise, model.plane_set, rows, model.time_resolution]
-    of_time += [model.texels_of_time, seed]
+    of_time += [model.texels_of_time(), seed]
     inputs = [parts.key, config.static, model.resolution, of_time if moving else []]
     return cache.stage("planes", inputs, make)
 

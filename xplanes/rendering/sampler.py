@@ -48,7 +48,7 @@ class Site:
         views: Training views; None if a checkpoint is loaded without its data.
         positions: Number of positions of the training cameras; None if unknown.
         initialised: Whether the initial field already shows the scene.
-        pixels: Image pixels that a side of the field's cube covers, see `pixels_of_detail`.
+        pixels: Image pixels that a side of the field's cube covers.
         surrounded: Whether the training images show surroundings, which lie behind the field's
             cube.
         cameras: Training cameras whose poses are refined; None if they are taken as exact.

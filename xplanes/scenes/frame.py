@@ -261,17 +261,6 @@ def pixels_across(views: Views, frame: Frame) -> float:
     return float((2 / frame.scale / pixel).median())
 
 
-def pixels_of_detail(views: Views, frame: Frame, surrounded: bool) -> float:
-    """`pixels_across`, or 0 for dynamic scenes with surroundings: planes do not depend on it.
-
-    Args:
-        views: Training views.
-        frame: The field's frame.
-        surrounded: Whether the images show surroundings.
-    """
-    return 0.0 if surrounded and not views.is_static else pixels_across(views, frame)
-
-
 def _middle_box(views: Views, points: Tensor, centre: Tensor) -> Tensor | None:
     """The box, with a margin, of points that most cameras see in the middle of their images.
 

@@ -25,7 +25,7 @@ from xplanes.models.base import ModelSettings
 from xplanes.process import train_command
 from xplanes.scenes.cameras import image_plane
 from xplanes.scenes.entries import some
-from xplanes.scenes.frame import Frame, pixels_across, pixels_of_detail
+from xplanes.scenes.frame import Frame, pixels_across
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
@@ -219,9 +219,10 @@ def inspect(choice: Choice) -> Capture:
     if frame is not None:
         width = _width_of_training(choice, scene) or train.width
         share = width / train.width
-        texels = model.texels(share * pixels_of_detail(train, frame, scene.is_surrounded))
+        pixels = share * pixels_across(train, frame)
+        texels = model.texels(pixels, scene.is_surrounded and not train.is_static)
         if texels is not None:
-            per_texel = share * pixels_across(train, frame) / texels
+            per_texel = pixels / texels
             fine = getattr(model, "fine", None) is not None
             findings += texel_findings(per_texel, width, texels, fine=fine)
     follows = {kind for each in findings for kind in CONSEQUENCES.get(each.kind, ())}

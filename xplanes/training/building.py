@@ -25,7 +25,7 @@ from xplanes.scenes.frame import (
     CubeHints,
     Frame,
     frame_content,
-    pixels_of_detail,
+    pixels_across,
     read_frame,
 )
 from xplanes.scenes.views import Scene
@@ -146,7 +146,7 @@ def build_parts(
         views=views,
         positions=len(views.camera_to_world[:, :3, 3].unique(dim=0)),
         initialised=found.values is not None,
-        pixels=pixels_of_detail(views, found.frame, scene.is_surrounded),
+        pixels=pixels_across(views, found.frame),
         surrounded=scene.is_surrounded,
         cameras=cameras if scene.refine_cameras else None,
         exposed=cameras if rays.matches_exposure and scene.is_surrounded else None,

@@ -1,5 +1,6 @@
 """Fine planes: as many texels as the images show, trained from their first step on, resumed."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,8 @@ from tests.balls import ball_scene
 from tests.training.runs import UNSCORED, changed, gone_on, same_state, small_config
 from xplanes.models import x_planes
 from xplanes.models.initialisation import Method
+from xplanes.rendering.sampler import Site
+from xplanes.scenes.frame import cube_frame
 from xplanes.training.module import RadianceModule
 
 FINE = ("model.fine.texels=40", "model.fine.start=2", "model.fine.channels=3")
@@ -30,15 +33,20 @@ def test_fine_planes_have_the_texels_that_the_images_show(pixels, texels):
 @pytest.mark.parametrize(
     ("pixels", "texels"), [(0, 64), (200, 64), (320, 64), (400, 96), (480, 128), (4000, 128)]
 )
-def test_where_things_move_before_surroundings_only_time_planes_follow_pixels(pixels, texels):
+def test_before_surroundings_only_time_planes_follow_pixels(pixels, texels):
     model = settings("model.resolution=64")
-    assert model.texels_of_time(pixels) == 64
-    assert model.texels_of_time(pixels, True) == texels
     assert (model.fine_texels(pixels, True), model.texels(pixels, True)) == (0, 64)
-    plain = settings("model.time_texels=null")
-    assert plain.texels_of_time(pixels, True) == plain.resolution
-    assert settings("model.time_texels=50").texels_of_time(pixels, True) == 50
     assert settings("model.fine.texels=100").fine_texels(pixels, True) == 100
+    seen = {"seed": 0, "precision": "32", "pixels": pixels, "positions": 50, "surrounded": True}
+    site = Site(cube_frame(1.0, torch.zeros(3)), torch.tensor([0.0, 1.0]), **seen)
+    assert model.texels_of_time(site) == texels
+    assert model.texels_of_time() == 64
+    for change in ({"positions": 49}, {"positions": None}, {"surrounded": False}):
+        assert model.texels_of_time(replace(site, **change)) == 64
+    assert settings("model.resolution=64", "model.time_texels=null").texels_of_time(site) == 64
+    assert settings("model.time_texels=50").texels_of_time(site) == 50
+    time_planes = model.build_field(site).time
+    assert time_planes.shape[-2] == texels
 
 
 def test_they_may_be_given_or_left_out():

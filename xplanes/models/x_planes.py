@@ -50,8 +50,9 @@ FINE_WARMUP = 100
 TEXELS_PER_PIXEL, TEXEL_STEP, MOST_TEXELS = 0.66, 32, 256
 """Fine planes with texels=auto: texels per image pixel, rounding step, and maximum of texels."""
 
-TIME_TEXELS_PER_PIXEL, MOST_TIME_TEXELS = 0.25, 128
-"""The same for time planes with time_texels=auto."""
+TIME_TEXELS_PER_PIXEL, MOST_TIME_TEXELS, LEAST_POSITIONS = 0.25, 128, 50
+"""With time_texels=auto: texels of time planes per image pixel, maximum of texels, and number of
+camera positions from which on they follow the pixels."""
 
 FINER = 2.0
 """With texels=auto, fine planes need at least this many times the texels of space planes."""
@@ -150,9 +151,10 @@ class XPlanesSettings(ModelSettings):
     # Rows along time. half: half the distinct times, as in K-Planes, or all if four or more views
     # show each; null: the same, but at least the LRM's timesteps.
     time_resolution: Count | Literal["half"] | None
-    # Texels of the time planes along space. auto: as many as the space planes, or, in moving scenes
-    # with surroundings and without an LRM, one per four image pixels across the field's cube, up to
-    # 128, if these are more; null: as many as the space planes.
+    # Texels of the time planes along space. auto: as many as the space planes, or, before
+    # surroundings, seen from at least 50 camera positions, and without an LRM, one per four image
+    # pixels across the field's cube, up to 128, if these are more; null: as many as the space
+    # planes.
     time_texels: Count | Literal["auto"] | None
     channels: Count  # Channels of each plane.
     fine: FineSettings | None  # Fine space planes; null: none.
@@ -177,13 +179,15 @@ class XPlanesSettings(ModelSettings):
         decoder = replace(self.decoder, colour_bias=max(self.decoder.colour_bias, 2.0))
         return replace(self, loss=loss, decoder=decoder)
 
-    def texels_of_time(self, pixels: float = 0.0, moves_in_surroundings: bool = False) -> int:
-        """Texels of the time planes along space. Arguments as for `texels`."""
+    def texels_of_time(self, site: Site | None = None) -> int:
+        """Texels of the time planes along space; without a site for planes from an LRM."""
         if isinstance(self.time_texels, int):
             return self.time_texels
-        if self.time_texels is None or not moves_in_surroundings:
+        if self.time_texels is None or site is None or not site.surrounded:
             return self.resolution
-        texels = TEXEL_STEP * round(TIME_TEXELS_PER_PIXEL * pixels / TEXEL_STEP)
+        if (site.positions or 0) < LEAST_POSITIONS:
+            return self.resolution
+        texels = TEXEL_STEP * round(TIME_TEXELS_PER_PIXEL * site.pixels / TEXEL_STEP)
         return max(self.resolution, min(texels, MOST_TIME_TEXELS))
 
     def texels(self, pixels: float, moves_in_surroundings: bool = False) -> int:
@@ -230,14 +234,15 @@ class XPlanesSettings(ModelSettings):
         plane_set = self.plane_set if site.moves else "three"
         background = None if self.background is None else self.background.build(site)
         generator = step_generator(site.seed, 0, Stream.INITIAL_FIELD)
-        seen = site.pixels, site.moves and site.surrounded
         planes: Mapping[str, Tensor]
         if initial is not None:
             planes = initial.planes
         else:
-            rows, texels = self.rows_of_time(site.times), self.texels_of_time(*seen)
+            rows, texels = self.rows_of_time(site.times), self.texels_of_time(site)
             planes = self.random_planes(plane_set, rows, texels, generator)
-        if self.fine is not None and (texels := self.fine_texels(*seen)):
+        if self.fine is not None and (
+            texels := self.fine_texels(site.pixels, site.moves and site.surrounded)
+        ):
             zeros = torch.zeros(min(self.fine.channels, self.channels), texels, texels)
             planes = {**planes, **dict.fromkeys(FINE_PLANES, zeros)}
         options = self.decoder

@@ -170,13 +170,8 @@ class ModelSettings(Settings, ABC):
         """
         return None
 
-    def texels(self, pixels: float, moves_in_surroundings: bool = False) -> int | None:
-        """Texels of the finest space planes along each axis; None for fields without planes.
-
-        Args:
-            pixels: Image pixels that a side of the field's cube covers; 0 if not known.
-            moves_in_surroundings: Whether the scene moves and its images show surroundings.
-        """
+    def texels(self, site: Site) -> int | None:
+        """Texels of the finest space planes along each axis; None for fields without planes."""
         texels = getattr(self, "resolution", None)
         return texels if isinstance(texels, int) else None
 

@@ -50,9 +50,9 @@ FINE_WARMUP = 100
 TEXELS_PER_PIXEL, TEXEL_STEP, MOST_TEXELS = 0.66, 32, 256
 """Fine planes with texels=auto: texels per image pixel, rounding step, and maximum of texels."""
 
-TIME_TEXELS_PER_PIXEL, MOST_TIME_TEXELS, LEAST_POSITIONS = 0.25, 128, 50
-"""With time_texels=auto: texels of time planes per image pixel, maximum of texels, and number of
-camera positions from which on they follow the pixels."""
+USUAL_TEXELS, MORE_TEXELS, LEAST_PIXELS, LEAST_POSITIONS = 64, 96, 480, 50
+"""Space planes with resolution=auto: texels, and more texels where as many pixels cover the cube
+and as many camera positions show a moving scene with surroundings."""
 
 FINER = 2.0
 """With texels=auto, fine planes need at least this many times the texels of space planes."""
@@ -147,15 +147,15 @@ class XPlanesSettings(ModelSettings):
     field_class: ClassVar[type[XPlanes]] = XPlanes
 
     plane_set: Literal["six", "nine", "three"]  # Planes; three: a static field.
-    resolution: Count  # Texels along each space axis.
+    # Texels along each space axis. auto: 64; 96 in randomly initialised fields of moving scenes
+    # with surroundings, seen from at least 50 camera positions, where at least 480 image pixels
+    # cover a side of the cube.
+    resolution: Count | Literal["auto"]
     # Rows along time. half: half the distinct times, as in K-Planes, or all if four or more views
     # show each; null: the same, but at least the LRM's timesteps.
     time_resolution: Count | Literal["half"] | None
-    # Texels of the time planes along space. auto: as many as the space planes, or, before
-    # surroundings, seen from at least 50 camera positions, and without an LRM, one per four image
-    # pixels across the field's cube, up to 128, if these are more; null: as many as the space
-    # planes.
-    time_texels: Count | Literal["auto"] | None
+    # Texels of the time planes along space; null: as many as the space planes.
+    time_texels: Count | None
     channels: Count  # Channels of each plane.
     fine: FineSettings | None  # Fine space planes; null: none.
     space_scale: Weight  # Standard deviation of randomly initialised space planes.
@@ -179,26 +179,25 @@ class XPlanesSettings(ModelSettings):
         decoder = replace(self.decoder, colour_bias=max(self.decoder.colour_bias, 2.0))
         return replace(self, loss=loss, decoder=decoder)
 
-    def texels_of_time(self, site: Site | None = None) -> int:
-        """Texels of the time planes along space; without a site for planes from an LRM."""
-        if isinstance(self.time_texels, int):
-            return self.time_texels
-        if self.time_texels is None or site is None or not site.surrounded:
+    def coarse_texels(self, site: Site | None = None) -> int:
+        """Texels of the space planes along each axis; without a site for planes from an LRM."""
+        if self.resolution != "auto":
             return self.resolution
-        if (site.positions or 0) < LEAST_POSITIONS:
-            return self.resolution
-        texels = TEXEL_STEP * round(TIME_TEXELS_PER_PIXEL * site.pixels / TEXEL_STEP)
-        return max(self.resolution, min(texels, MOST_TIME_TEXELS))
+        if site is None or not (site.surrounded and site.moves):
+            return USUAL_TEXELS
+        many = (site.positions or 0) >= LEAST_POSITIONS and site.pixels >= LEAST_PIXELS
+        return MORE_TEXELS if many else USUAL_TEXELS
 
-    def texels(self, pixels: float, moves_in_surroundings: bool = False) -> int:
-        return max(self.resolution, self.fine_texels(pixels, moves_in_surroundings))
+    def texels(self, site: Site) -> int:
+        return max(self.coarse_texels(site), self.fine_texels(site))
 
-    def fine_texels(self, pixels: float, moves_in_surroundings: bool = False) -> int:
-        """Texels of the fine planes along each space axis, or 0. Arguments as for `texels`."""
+    def fine_texels(self, site: Site) -> int:
+        """Texels of the fine planes along each space axis; 0 for none."""
         if self.fine is None or self.fine.texels != "auto":
             return 0 if self.fine is None else int(self.fine.texels)
-        texels = min(TEXEL_STEP * round(TEXELS_PER_PIXEL * pixels / TEXEL_STEP), MOST_TEXELS)
-        return 0 if texels < FINER * self.resolution or moves_in_surroundings else texels
+        texels = min(TEXEL_STEP * round(TEXELS_PER_PIXEL * site.pixels / TEXEL_STEP), MOST_TEXELS)
+        soft = site.surrounded and site.moves
+        return 0 if soft or texels < FINER * self.coarse_texels(site) else texels
 
     def rows_of_time(self, times: Tensor, frames: int = 0) -> int:
         """Rows of the time planes.
@@ -212,15 +211,18 @@ class XPlanesSettings(ModelSettings):
         return max(time_rows(times), frames if self.time_resolution is None else 0)
 
     def random_planes(
-        self, plane_set: str, rows: int, time_texels: int, generator: torch.Generator
+        self, plane_set: str, rows: int, texels: int, generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """Random planes with ``rows`` rows along time, see `fields.xplanes.random_planes`."""
+        """Random planes with ``texels`` along space and ``rows`` along time.
+
+        See `fields.xplanes.random_planes`.
+        """
         return random_planes(
             plane_set,
             channels=self.channels,
-            resolution=self.resolution,
+            resolution=texels,
             time_resolution=rows,
-            time_texels=time_texels,
+            time_texels=self.time_texels,
             space_scale=self.space_scale,
             time_scale=self.time_scale,
             generator=generator,
@@ -238,11 +240,9 @@ class XPlanesSettings(ModelSettings):
         if initial is not None:
             planes = initial.planes
         else:
-            rows, texels = self.rows_of_time(site.times), self.texels_of_time(site)
+            rows, texels = self.rows_of_time(site.times), self.coarse_texels(site)
             planes = self.random_planes(plane_set, rows, texels, generator)
-        if self.fine is not None and (
-            texels := self.fine_texels(site.pixels, site.moves and site.surrounded)
-        ):
+        if self.fine is not None and (texels := self.fine_texels(site)):
             zeros = torch.zeros(min(self.fine.channels, self.channels), texels, texels)
             planes = {**planes, **dict.fromkeys(FINE_PLANES, zeros)}
         options = self.decoder

@@ -176,7 +176,7 @@ def convert_stage(
             target,
             plane_set=model.plane_set,
             dynamic=dynamic,
-            resolution=model.texels_of_time(),
+            resolution=model.time_texels or model.coarse_texels(),
             time_resolution=rows,
             noise=config.noise,
             generator=step_generator(seed, 0, Stream.NOISE),
@@ -184,7 +184,7 @@ def convert_stage(
 
     def make() -> dict[str, Any]:
         low_rank = parts.content["low_rank"].to(device)
-        space = space_planes(low_rank, static=config.static, resolution=model.resolution)
+        space = space_planes(low_rank, static=config.static, resolution=model.coarse_texels())
         content: dict[str, Any] = {"space": space.cpu(), "time": None, "unexplained": {}}
         if sparse is not None:
             target = sparse.to(device)
@@ -198,8 +198,8 @@ def convert_stage(
 
     rows = PLANE_SETS[model.plane_set]  # A user's own plane set may change without a new name.
     of_time = [config.dynamic, config.noise, model.plane_set, rows, model.time_resolution]
-    of_time += [model.texels_of_time(), seed]
-    inputs = [parts.key, config.static, model.resolution, of_time if moving else []]
+    of_time += [model.time_texels or model.coarse_texels(), seed]
+    inputs = [parts.key, config.static, model.coarse_texels(), of_time if moving else []]
     return cache.stage("planes", inputs, make)
 
 

@@ -251,6 +251,11 @@ class Views:
         return f"{'up to ' if self.is_padded else ''}{self.width}x{self.height} px"
 
     @property
+    def positions(self) -> int:
+        """Number of distinct camera positions."""
+        return len(self.camera_to_world[:, :3, 3].unique(dim=0))
+
+    @property
     def is_static(self) -> bool:
         """Whether all views show one timestep, so that nothing can move."""
         return bool((self.times == self.times[0]).all())

@@ -23,6 +23,7 @@ from xplanes.evaluation.findings import (
 )
 from xplanes.models.base import ModelSettings
 from xplanes.process import train_command
+from xplanes.rendering.sampler import Site
 from xplanes.scenes.cameras import image_plane
 from xplanes.scenes.entries import some
 from xplanes.scenes.frame import Frame, pixels_across
@@ -220,7 +221,8 @@ def inspect(choice: Choice) -> Capture:
         width = _width_of_training(choice, scene) or train.width
         share = width / train.width
         pixels = share * pixels_across(train, frame)
-        texels = model.texels(pixels, scene.is_surrounded and not train.is_static)
+        seen = {"pixels": pixels, "positions": train.positions, "surrounded": scene.is_surrounded}
+        texels = model.texels(Site(frame, train.times, seed=0, precision="32", **seen))
         if texels is not None:
             per_texel = pixels / texels
             fine = getattr(model, "fine", None) is not None

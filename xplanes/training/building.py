@@ -144,7 +144,7 @@ def build_parts(
         precision=precision_of(found.model, device),
         bounds=found.model.bounds(views),
         views=views,
-        positions=len(views.camera_to_world[:, :3, 3].unique(dim=0)),
+        positions=views.positions,
         initialised=found.values is not None,
         pixels=pixels_across(views, found.frame),
         surrounded=scene.is_surrounded,

@@ -191,6 +191,16 @@ def test_dates_and_numbers_are_not_mixed(capture, number):
     capture.refused("frame 1 .*time is '2026-01-02T11:59:50Z'; it must be .*, or all dates")
 
 
+def test_numbers_in_names_are_the_times_of_a_video_that_is_known_to_change(capture):
+    assert capture.all().times.tolist() == [0] * 10
+    found = settings(NerfstudioSettings, "nerfstudio", capture.path, static=False, eval_every=100)
+    scene = found.load(["train"])
+    assert scene.splits["train"].times.tolist() == pytest.approx([i / 9 for i in range(10)])
+    assert "numbers in their names" in scene.notes["times"]
+    capture.timed([2, *range(9)])  # Times of the file come first.
+    assert found.load(["train"]).splits["train"].times.tolist().count(0.25) == 2
+
+
 def test_times_from_0_to_1_stay(capture, caplog):
     capture.timed([0.1 + i / 20 for i in range(10)])
     with caplog.at_level(logging.INFO, logger="xplanes"):

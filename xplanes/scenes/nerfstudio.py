@@ -39,7 +39,7 @@ class NerfstudioSettings(CaptureSettings):
         if not path.is_file():
             raise self.no_scene()
         content = read_frames(path)
-        listing = listing_of(path, content)
+        listing = listing_of(path, content, dynamic=self.static is False)
         places = _listed_splits(path, content, listing)
         if places is None:
             places = held_out(listing, self.eval_every)

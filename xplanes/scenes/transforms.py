@@ -31,6 +31,7 @@ from xplanes.scenes.entries import (
 from xplanes.scenes.formats import read_header
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
 from xplanes.scenes.listing import Calibration, Listing, time_source
+from xplanes.scenes.name_times import times_in_names
 
 logger = logging.getLogger(__name__)
 
@@ -163,6 +164,7 @@ def listing_of(
     span: tuple[float, float] | None = None,
     *,
     movable: bool = True,
+    dynamic: bool = False,
 ) -> Listing:
     """The frames of a transforms file, checked.
 
@@ -174,6 +176,8 @@ def listing_of(
         span: First and last time of the scene, if it has several files; those of this one when
             None.
         movable: As for `Listing.checked`: false if the scene has several files.
+        dynamic: Whether the scene is known to change: without times in the file, the numbers in the
+            names of the images are its times.
 
     Raises:
         SceneError: If anything is missing, out of range, repeated, or outside the scene's folder.
@@ -183,6 +187,9 @@ def listing_of(
     paths = [frame.image for frame in frames]
     masks, meaning = _masks([(frame.image, frame.mask) for frame in frames])
     times, source = _times(path, frames, span)
+    names = [frame.entry["file_path"] for frame in frames]
+    if dynamic and not times and (found := times_in_names(names, dynamic=True)):
+        times, source = unit_times(found), time_source("the numbers in their names", names, found)
     if content.get("enable_ray_loading", True):
         _warn_of_rays(path, paths)
     listing = Listing.checked(
@@ -198,7 +205,7 @@ def listing_of(
         mask_meaning=meaning,
         clear=tuple(level for key, level in TRANSPARENT.items() if content.get(key)),
         time_source=source,
-        names=tuple(frame.entry["file_path"] for frame in frames),
+        names=tuple(names),
     )
     warn_of_unknown(path, content)
     return listing

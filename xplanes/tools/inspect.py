@@ -392,7 +392,8 @@ def table(capture: Capture) -> str:
     elif known["splits"]["train"]["timesteps"] == 1:
         text.append(
             "static  all training views have the same time, so nothing can move; if something "
-            'does, the files must give the times (in transforms files, "time" of each frame)'
+            'does, the files must give the times (in transforms files, "time" of each frame); '
+            "data.static=false takes the numbers in the names of images for times"
         )
     if (cube := known["cube"]) is not None:
         centre = ", ".join(f"{value:.3g}" for value in cube["centre"])

@@ -12,7 +12,7 @@ import torch
 from tests.balls import ball_scene, ball_views, inside_ball, surrounding, swinging
 from tests.baselines.runs import KPLANES, PROPOSAL
 from tests.refusals import assert_refused
-from tests.training.runs import changed, small_config
+from tests.training.runs import SMALL, changed, small_config
 from tests.training.test_health import spoil_gradient
 from xplanes.errors import ConfigError, SceneError
 from xplanes.lrm.alignment import align
@@ -27,15 +27,7 @@ from xplanes.scenes.frame import CubeHints, Frame, scene_frame
 from xplanes.training import fit as training
 from xplanes.training.module import RadianceModule, TrainingError
 
-SMALL_FIELD = (
-    "model.resolution=24",
-    "model.channels=8",
-    "model.decoder.width=32",
-    "model.sampler.grid_resolution=24",
-    "model.sampler.samples=64",
-    "model.sampler.update_cells=512",
-    "model.sampler.sweep_at=[15]",
-)
+SMALL_FIELD = tuple(text for text in SMALL if text.startswith("model."))
 TIMES = torch.linspace(0, 1, 50)
 VIEWS = {"openlrm": OPENLRM_VIEW, "triposr": TRIPOSR_VIEW}
 
@@ -48,12 +40,6 @@ def settings(folder: Path, *overrides: str) -> Method:
 
 def default_settings(*overrides: str) -> Method:
     return Method.read(changed(overrides))
-
-
-@pytest.fixture(autouse=True)
-def composed_once(monkeypatch):
-    """Composing takes a fifth of a second."""
-    monkeypatch.setattr(module, "compose_plain", lambda _, lines: changed(tuple(lines)))
 
 
 def video_of(method, scene, folder, size=24):

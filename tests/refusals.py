@@ -5,6 +5,13 @@ from collections.abc import Callable
 from typing import Any
 
 
+class Evil:
+    """Runs code when it is unpickled, which shows in what is printed."""
+
+    def __reduce__(self):
+        return print, ("code was run",)
+
+
 def assert_refused(
     error: type[Exception], words: str, call: Callable[[], Any], case: object
 ) -> str:

@@ -124,21 +124,6 @@ def test_only_the_planes_that_ask_get_gradients(function, asking):
     assert planes[1 - asking].grad is None
 
 
-def test_texel_centres_return_the_texels():
-    space, time = stacks("six", size=5, time_rows=4, time_size=5)
-    centre = -0.8 + 0.4 * torch.arange(5, dtype=torch.float64)
-    points = torch.stack([centre, centre.flip(0), centre], dim=-1)
-    value = plane_features(space, None, points, torch.zeros(5).double(), PLANE_SETS["six"])
-    step = torch.arange(5)
-    torch.testing.assert_close(value[:, 0], space[0, 4 - step, step])  # xy: rows y, columns x
-    torch.testing.assert_close(value[:, 1], space[1, step, step])
-    torch.testing.assert_close(value[:, 2], space[2, step, 4 - step])  # yz: rows z, columns y
-    rows = torch.arange(4, dtype=torch.float64) / 3
-    moving = plane_features(0 * space, time, points[:4], rows, PLANE_SETS["six"])
-    step = torch.arange(4)
-    torch.testing.assert_close(moving[:, 0], time[0, step, step] * time[1, step, 4 - step])
-
-
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")  # The interpreter's, on purpose.
 @of_each
 @of_each_float

@@ -20,11 +20,12 @@ def carved(views, *, resolution=24, bins=4, frame=None):
     return grid
 
 
-def allowed_at(grid, points, time):
-    """Whether the cells of points in the field's frame are allowed at a time."""
+def allowed_at(grid, points, time, among=None):
+    """Whether the cells of points in the field's frame are ``among`` others at a time."""
     x, y, z = ((points + 1) / 2 * grid.resolution).floor().long().unbind(dim=-1)
     shape = (grid.time_bins, *[grid.resolution] * 3)
-    return grid.allowed.view(shape)[int(grid.bins(torch.tensor([time]))), z, y, x]
+    among = grid.allowed if among is None else among
+    return among.view(shape)[int(grid.bins(torch.tensor([time]))), z, y, x]
 
 
 @pytest.mark.parametrize("size", [24, 64])

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 
@@ -10,6 +11,18 @@ class Evil:
 
     def __reduce__(self):
         return print, ("code was run",)
+
+
+def interrupt(*_args: Any, **_options: Any) -> None:
+    """Takes the place of a function during which Ctrl-C is pressed."""
+    raise KeyboardInterrupt
+
+
+def flip(path: Path, place: int) -> None:
+    """Flip one bit of a file, which keeps its size."""
+    content = bytearray(path.read_bytes())
+    content[place] ^= 1
+    path.write_bytes(content)
 
 
 def assert_refused(

@@ -2,12 +2,13 @@
 
 import logging
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import torch
 
-from tests.refusals import Evil
+from tests.refusals import Evil, flip
 from xplanes.backend import warm_up
 from xplanes.files import StorageError
 from xplanes.preparation import cache as cache_module
@@ -47,6 +48,19 @@ def test_a_stage_is_computed_once_and_loaded_unchanged(folder):
     assert stage.content["report"] == fresh["report"]
 
 
+def test_who_waits_for_another_process_takes_what_it_has_made(tmp_path, monkeypatch):
+    @contextmanager
+    def waiting(_):
+        monkeypatch.undo()
+        StageCache(tmp_path).stage("parts", INPUTS, Maker())
+        yield
+
+    monkeypatch.setattr(cache_module, "in_turn", waiting)
+    make = Maker()
+    assert StageCache(tmp_path).stage("parts", INPUTS, make, alone=True).cached
+    assert make.calls == 0
+
+
 def test_compiling_is_no_part_of_a_stages_time(folder, monkeypatch):
     def make():
         with warm_up.timed():
@@ -71,8 +85,7 @@ def damaged(path: Path, kind: str) -> None:
         path.write_bytes(b"")
     elif kind == "flipped":
         # A byte of the tensor itself, which torch reads without a murmur.
-        place = whole.index(torch.arange(64.0).numpy().tobytes()) + 101
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        flip(path, whole.index(torch.arange(64.0).numpy().tobytes()) + 101)
     elif kind == "foreign":
         torch.save(torch.zeros(3), path)
     elif kind == "code":

@@ -11,7 +11,7 @@ import torch
 
 from tests.balls import ball_scene, ball_views, inside_ball, surrounding, swinging
 from tests.baselines.runs import KPLANES, PROPOSAL
-from tests.refusals import assert_refused
+from tests.refusals import assert_refused, interrupt
 from tests.training.runs import SMALL, changed, small_config
 from tests.training.test_health import spoil_gradient
 from xplanes.errors import ConfigError, SceneError
@@ -309,16 +309,11 @@ def test_a_field_renders_the_scene_and_the_video_is_cached(tmp_path, small_field
 def test_an_interrupted_field_is_resumed(tmp_path, small_fields, monkeypatch):
     scene, cache = ball_scene(count=12, size=24), tmp_path / "cache"
     method = settings(tmp_path, "preparation.fixed_view_steps=3")
-
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    original = module._render
-    monkeypatch.setattr(module, "_render", stop)
-    with pytest.raises(KeyboardInterrupt):
-        video_of(method, scene, cache)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_render", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            video_of(method, scene, cache)
     assert list(cache.glob("fixed_view-*/checkpoints/last.ckpt"))
-    monkeypatch.setattr(module, "_render", original)
     again = lambda *_: pytest.fail("a step that was done is done again")  # noqa: E731
     monkeypatch.setattr(RadianceModule, "training_step", again)
     video_of(method, scene, cache)

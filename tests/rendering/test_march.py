@@ -65,11 +65,7 @@ def details(grid, *, step=STEP, skip_empty=True, occlusion=0.0, **options):
     return {"step": step, "occupied": occupied, "limit": limit, **options}
 
 
-def twin(rays, grid, **options):
-    return march_reference(Rays(*rays), grid, **details(grid, **options))
-
-
-def into(rays, grid, room, **options):
+def twin(rays, grid, room=None, **options):
     return march_reference(Rays(*rays), grid, room=room, **details(grid, **options))
 
 
@@ -85,22 +81,14 @@ def by_kernel(rays, grid, room=None, **options):
 of_each = pytest.mark.parametrize("take", [loops, twin, *([by_kernel] if triton else [])])
 
 
-def by_oracle(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0):
-    shape = (grid.time_bins, *[grid.resolution] * 3)
-    return oracle(
-        *(ray.double().numpy() for ray in rays),
-        grid.occupied.view(shape).numpy(),
-        grid.least.view(shape).double().numpy(),
-        step=step,
-        skip=skip_empty,
-        occlusion=occlusion,
-    )
-
-
-def as_the_oracle(rays, grid, **options):
+def as_the_oracle(rays, grid, *, skip_empty=True, **options):
     """Loops and twin take the samples of the oracle, whose counts are returned."""
-    kept, counts = by_oracle(rays, grid, **options)
-    for found in (loops(rays, grid, **options), twin(rays, grid, **options)):
+    shape = (grid.time_bins, *[grid.resolution] * 3)
+    cells = (cells.view(shape).double().numpy() for cells in (grid.occupied, grid.least))
+    given = {"step": STEP, "occlusion": 0.0, **options}
+    kept, counts = oracle(*(ray.double().numpy() for ray in rays), *cells, skip=skip_empty, **given)
+    for take in (loops, twin):
+        found = take(rays, grid, skip_empty=skip_empty, **options)
         assert found.ray.tolist() == [row[0] for row in kept]
         assert found.cells.tolist() == [row[2] for row in kept]
         np.testing.assert_allclose(found.distances, [row[1] for row in kept], atol=1e-12)
@@ -205,7 +193,7 @@ def test_any_grid_and_step(resolution, bins, step, occlusion, skip, seed):
 def test_a_fixed_number_of_places_takes_the_same_samples(skip, occlusion, dtype):
     grid, rays = grid_of(), rays_of(60, dtype)
     expected = twin(rays, grid, skip_empty=skip, occlusion=occlusion)
-    found = into(rays, grid, len(expected) + 30, skip_empty=skip, occlusion=occlusion)
+    found = twin(rays, grid, len(expected) + 30, skip_empty=skip, occlusion=occlusion)
     live = found.live
     assert live.sum() == found.count == len(expected)
     assert not live[len(expected) :].any()
@@ -225,7 +213,7 @@ def test_rays_without_room_are_left_out_whole(share):
     grid, rays = grid_of(), rays_of(60)
     whole = twin(rays, grid)
     room = int(share * len(whole))
-    found = into(rays, grid, room)
+    found = twin(rays, grid, room)
     shown = found.shown
     assert bool(shown.all()) == (room == len(whole))
     kept = shown[whole.ray]
@@ -259,7 +247,7 @@ def test_the_kernel_fills_a_fixed_number_of_places_as_the_twin_does(dtype, share
     number = len(twin(rays, grid, occlusion=0.001))
     assert number > 20
     found, expected = (
-        take(rays, grid, room=int(share * number), occlusion=0.001) for take in (by_kernel, into)
+        take(rays, grid, room=int(share * number), occlusion=0.001) for take in (by_kernel, twin)
     )
     same_places(found, expected)
 

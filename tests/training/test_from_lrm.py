@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.preparation.test_reconstruct import CHOICES, publish
+from tests.refusals import interrupt
 from tests.training.runs import SMALL, changed, metrics, status
 from xplanes.models.initialisation import STAGES
 from xplanes.preparation import fixed_view, sources
@@ -57,12 +58,8 @@ def test_a_stopped_preparation_resumes_from_the_last_finished_stage(train, tmp_p
     place = tmp_path / "uninterrupted"
     whole = metrics(train(*source(place, "openlrm-1.1"), RENDERED, name="uninterrupted/run"))
     overrides = (*source(tmp_path, "openlrm-1.1"), RENDERED)
-
-    def stop(*_args, **_options):
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(sources, "from_sequence", stop)
+        patch.setattr(sources, "from_sequence", interrupt)
         with pytest.raises(KeyboardInterrupt):
             train(*overrides)
     assert status(tmp_path / "run")["status"] == "interrupted"

@@ -119,12 +119,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     trained, scenes, given, train, tmp_path, monkeypatch
 ):
     broken_off((13,), small_config(scenes, *given), tmp_path / "run")
-
-    def refuse(*_args, **_options):
-        raise AssertionError("decomposed again")
-
-    # The parts come from the cache.
-    monkeypatch.setattr(stages_module, "decompose", refuse)
+    again = lambda *_, **__: pytest.fail("the parts come from the cache")  # noqa: E731
+    monkeypatch.setattr(stages_module, "decompose", again)
     folder = train(*given, resume=True)
     assert outcome(folder) == outcome(trained)
     assert metrics(folder)["decomposition"] == metrics(trained)["decomposition"]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.refusals import flip
 from tests.synthetic.pretraining.small import SIDE, same, small_pool
 from xplanes.errors import ConfigError
 from xplanes.lrm.canonical import OPENLRM_VIEW, CanonicalView
@@ -79,10 +80,7 @@ def test_an_interrupted_pool_is_resumed(short_shards, whole, tmp_path, monkeypat
 
 def test_a_damaged_shard_is_generated_again(short_shards, whole, tmp_path):
     shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
-    path = tmp_path / "00001.npy"
-    damaged = bytearray(path.read_bytes())
-    damaged[-7] ^= 1
-    path.write_bytes(damaged)
+    flip(tmp_path / "00001.npy", -7)
     assert content(drawn(tmp_path)) == content(drawn(whole))
 
 

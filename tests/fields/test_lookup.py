@@ -12,11 +12,7 @@ from tests.oracles import plane_features as oracle
 from xplanes.backend import threads
 from xplanes.fields import lookup
 from xplanes.fields import lookup_numba as cpu
-from xplanes.fields.lookup import (
-    plane_features,
-    plane_features_gpu,
-    plane_features_reference,
-)
+from xplanes.fields.lookup import plane_features, plane_features_gpu, plane_features_reference
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES
 
 TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-13}

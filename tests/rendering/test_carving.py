@@ -55,11 +55,7 @@ def test_content_close_to_wide_cameras_is_kept(distance):
 
 @pytest.mark.parametrize(
     ("count", "radius", "turns", "share"),
-    [
-        (50, 0.4, 0.25, 0.0),
-        (50, 0.3, 1, 0.0005),
-        (200, 0.15, 2, 0.001),
-    ],
+    [(50, 0.4, 0.25, 0.0), (50, 0.3, 1, 0.0005), (200, 0.15, 2, 0.001)],
 )
 def test_a_moving_ball_is_never_ruled_out_and_most_else_is_empty(count, radius, turns, share):
     # In the span over which content counts as static, with 50 views, the slow ball moves by

@@ -55,7 +55,7 @@ def test_records_depend_on_their_seed_only(short_shards, whole):
     assert len(pool) == 6
     assert content(pool)[3] == draw_sample(3, 2, 16)[0].tobytes()
     assert set(json.loads((whole / "pool.json").read_text())["sha256"]) == {
-        *("00000.npy", "00001.npy", "00002.npy"),
+        *("00000.npy", "00001.npy", "00002.npy")
     }
 
 

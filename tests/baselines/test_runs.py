@@ -12,8 +12,7 @@ from tests.baselines.runs import (
     baseline_config,
     under,
 )
-from tests.training.runs import broken_off, checkpoint, metrics, same_state
-from xplanes.files import read_rows
+from tests.training.runs import broken_off, checkpoint, metrics, same_state, scores
 from xplanes.run import run
 from xplanes.tools.evaluate import evaluate
 from xplanes.tools.render import VideoOptions, render_video
@@ -37,10 +36,6 @@ RUNS = {
     "tensor4d_density": (1.5, None, 20, ("model=tensor4d_density", *TENSOR4D, *CELLS)),
 }
 """Least gain in dB, the step at which another run fails and is resumed, steps, and overrides."""
-
-
-def scores(folder):
-    return [float(row["psnr"]) for row in read_rows(folder / "curve.csv")]
 
 
 def check_run(scenes, folder, gain, stop, overrides):

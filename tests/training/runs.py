@@ -120,6 +120,11 @@ def metrics(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "metrics.json").read_text())
 
 
+def scores(folder: Path) -> list[float]:
+    """PSNR of the evaluations of a run."""
+    return [float(row["psnr"]) for row in read_rows(folder / "curve.csv")]
+
+
 def status(folder: Path) -> dict[str, Any]:
     """What run.json of a run says."""
     return json.loads((folder / "run.json").read_text())

@@ -5,16 +5,23 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from tests.refusals import interrupt
-from tests.warm import VIDEO_FRAMES
 from xplanes.synthetic.demo import ensure_demo_scene, write
 from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE
 
-USUAL_FRAMES = write.VIDEO_FRAMES
+USUAL_FRAMES, FRAMES = write.VIDEO_FRAMES, 5
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_videos():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(write, "VIDEO_FRAMES", FRAMES)
+        yield
 
 
 def make(root: Path, name: str = "balls", **changes) -> Path:
@@ -32,14 +39,14 @@ def index(folder: Path, split: str) -> dict:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory, short_videos) -> Path:
     return make(tmp_path_factory.mktemp("demo"))
 
 
 def test_layout_is_that_of_d_nerf(folder):
     assert folder.name == "balls_16px_s0_4-2-3"
     assert USUAL_FRAMES == 50
-    counts = {"train": 4, "val": 2, "test": 3, "video": VIDEO_FRAMES}
+    counts = {"train": 4, "val": 2, "test": 3, "video": FRAMES}
     for split, count in counts.items():
         content = index(folder, split)
         assert content["camera_angle_x"] == CAMERA_ANGLE_X
@@ -75,8 +82,7 @@ def test_times_and_cameras(folder):
     assert torch.pdist(places).min() > 1e-3
     video = index(folder, "video")["frames"]
     assert all(frame["transform_matrix"] == video[0]["transform_matrix"] for frame in video)
-    expected = [number / (VIDEO_FRAMES - 1) for number in range(VIDEO_FRAMES)]
-    assert [frame["time"] for frame in video] == pytest.approx(expected)
+    assert [frame["time"] for frame in video] == pytest.approx(np.linspace(0, 1, FRAMES).tolist())
 
 
 def test_the_same_request_gives_the_same_bytes(folder, tmp_path):

@@ -28,12 +28,8 @@ class Tally:
     """Counts of one test; its docstring names the fault."""
 
     def __init__(self, kind: str) -> None:
-        self.content: dict[str, Any] = {
-            "kind": kind.strip().rstrip("."),
-            "cases": 0,
-            "recovered": 0,
-            "said": 0,
-        }
+        counts = dict.fromkeys(("cases", "recovered", "said"), 0)
+        self.content: dict[str, Any] = {"kind": kind.strip().rstrip("."), **counts}
 
     def recovered(self) -> None:
         """Count a case that came to what it would have come to without the fault."""

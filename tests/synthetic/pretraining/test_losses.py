@@ -50,6 +50,8 @@ def test_samples_fill_the_box_and_crowd_around_the_hit():
         assert (distances[0, :2] >= 2).all(), samples
         assert (distances[0, :2] <= 4).all(), samples
         torch.testing.assert_close(lengths.sum(dim=-1)[0], torch.tensor([2.0, 2, 0, 2]))
+        # None is as long as two of the parts into which half of them divide the box.
+        assert (lengths[0, :2] <= 4 / (samples // 2)).all(), samples
         near = (distances[0, 0] - 2.5).abs() <= 0.1 + 1e-6
         assert near.sum() >= samples - samples // 2, samples
 

@@ -83,22 +83,6 @@ def splat(given, camera, background=None, antialiased=False):
     return colour, opacity, depth / np.maximum(opacity, 1e-10)
 
 
-def slopes(function, arrays, step=1e-6):
-    """Central differences of a number by every entry of some arrays."""
-    found = []
-    for index, array in enumerate(arrays):
-        gradient = np.zeros_like(array)
-        for entry in np.ndindex(*array.shape):
-            values = []
-            for sign in (1, -1):
-                moved = array.copy()
-                moved[entry] += sign * step
-                values.append(function(*arrays[:index], moved, *arrays[index + 1 :]))
-            gradient[entry] = (values[0] - values[1]) / (2 * step)
-        found.append(gradient)
-    return found
-
-
 def harmonic(degree, order, direction):
     """Real spherical harmonic with the Condon-Shortley phase, from Rodrigues' formula."""
     x, y, z = np.asarray(direction, np.float64) / np.linalg.norm(direction)

@@ -3,13 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from tests.training.runs import changed
-
-
-def under(group: str, **values: Any) -> tuple[str, ...]:
-    """Overrides of keys in a group."""
-    return tuple(f"{group}.{key}={value}" for key, value in values.items())
-
+from tests.training.runs import changed, under
 
 SCENE = (
     *under("data", resolution=12, train_views=8, test_views=2, val_views=1),

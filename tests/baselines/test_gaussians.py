@@ -40,25 +40,24 @@ TURN = torch.linalg.qr(torch.tensor([[1.0, 0.5, 0.2], [-0.3, 1.0, 0.4], [0.1, -0
 TURNED = replace(FRAME, rotation=TURN * torch.linalg.det(TURN).sign())
 
 
-def gaussians(count: int, *, degree: int = 1, moves: bool = True) -> HexPlaneGaussians:
-    """Gaussians with numbers of their own in every row."""
-    torch.manual_seed(0)
-    planes = PlaneProducts(4, 6, [1, 2], 5, low=0.1, high=0.5) if moves else None
-    field = HexPlaneGaussians(
-        PointCloud(torch.rand(count, 3) - 0.5, torch.rand(count, 3)),
-        degree=degree,
-        extent=2.0,
-        planes=planes,
-        width=8,
-    )
+def shaken(field: Any, network: float = 0.05) -> Any:
+    """The field with numbers of its own in every row, and in its network."""
     with torch.no_grad():
         for name in field.PARAMETERS[1:]:
             getattr(field, name).add_(0.3 * torch.randn_like(getattr(field, name)))
-        for parameter in field.network.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))
+        for parameter in getattr(field, "network", torch.nn.Module()).parameters():
+            parameter.add_(network * torch.randn_like(parameter))
     field.deforms.fill_(True)
-    field.degree.fill_(degree)
     return field
+
+
+def gaussians(count: int, *, degree: int = 1) -> HexPlaneGaussians:
+    torch.manual_seed(0)
+    planes = PlaneProducts(4, 6, [1, 2], 5, low=0.1, high=0.5)
+    cloud = PointCloud(torch.rand(count, 3) - 0.5, torch.rand(count, 3))
+    field = HexPlaneGaussians(cloud, degree=degree, extent=2.0, planes=planes, width=8)
+    field.degree.fill_(degree)
+    return shaken(field)
 
 
 def stepped(field: Gaussians, steps: int = 3) -> torch.optim.Adam:

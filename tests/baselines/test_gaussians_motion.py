@@ -9,7 +9,7 @@ import torch
 
 from tests.balls import ball_scene, ball_views, swinging
 from tests.baselines.runs import baseline_config
-from tests.baselines.test_gaussians import FRAME, control, settings, stepped
+from tests.baselines.test_gaussians import FRAME, control, settings, shaken, stepped
 from xplanes.baselines.gaussians import points
 from xplanes.baselines.gaussians.densification import densify
 from xplanes.baselines.gaussians.field import DeformedGaussians, PointCloud, SpacetimeGaussians
@@ -29,20 +29,9 @@ def cloud(count, seed=0):
     return PointCloud(torch.rand(count, 3) - 0.5, torch.rand(count, 3), torch.rand(count))
 
 
-def shaken(field):
-    """The field with numbers of its own everywhere."""
-    with torch.no_grad():
-        for name in field.PARAMETERS[1:]:
-            getattr(field, name).add_(0.3 * torch.randn_like(getattr(field, name)))
-        for parameter in getattr(field, "network", torch.nn.Module()).parameters():
-            parameter.add_(0.1 * torch.randn_like(parameter))
-    field.deforms.fill_(True)
-    return field
-
-
 def spacetime(count, *, moves=True):
     field = SpacetimeGaussians(cloud(count), degree=1, extent=2.0, moves=moves, width=0.5)
-    return shaken(field) if moves else field
+    return shaken(field, network=0.1) if moves else field
 
 
 def deformed(count, *, depth=3, moves=True, **noise):
@@ -50,7 +39,7 @@ def deformed(count, *, depth=3, moves=True, **noise):
         cloud(count), degree=1, extent=2.0, moves=moves,
         depth=depth, width=8, octaves=(2, 3), **noise,
     )  # fmt: skip
-    return shaken(field) if moves else field
+    return shaken(field, network=0.1) if moves else field
 
 
 def doubles(field):

@@ -12,8 +12,7 @@ from tests.baselines.runs import (
     baseline_config,
     under,
 )
-from tests.training.runs import broken_off, checkpoint, metrics, same_state
-from xplanes.files import read_rows
+from tests.training.runs import broken_off, checkpoint, metrics, same_state, scores
 from xplanes.run import run
 from xplanes.tools.evaluate import evaluate
 from xplanes.tools.render import VideoOptions, render_video
@@ -21,54 +20,22 @@ from xplanes.tools.runs import load_run
 
 FAST = ("model=kplanes", *KPLANES, "model.channels=8", "model.learning_rate=0.03")
 
+FEW_RAYS = under("model.rays", per_batch=128, samples_per_batch=1024)
+PLANES = (*under("model", resolution=16, channels=4), FEW_RAYS[0])
+CELLS = (*OCCUPANCY, *FEW_RAYS)
+SOON = under("model", fine_from=6, blur_until=15)
+
 RUNS = {
-    "kplanes": (3, 23, (*FAST, *PROPOSAL, "trainer.max_steps=36")),
-    "kplanes in cells": (
-        2,
-        None,
-        (*FAST, "model/sampler=occupancy", *OCCUPANCY, "trainer.max_steps=60"),
-    ),
-    "six_planes with proposals": (
-        2,
-        None,
-        (
-            *("model/sampler=proposal", *PROPOSAL, "model.rays.per_batch=128"),
-            *under("model", resolution=16, channels=4),
-            "trainer.max_steps=20",
-        ),
-    ),
+    "kplanes": (3, 23, 36, (*FAST, *PROPOSAL)),
+    "kplanes in cells": (2, None, 60, (*FAST, "model/sampler=occupancy", *OCCUPANCY)),
+    "six_planes with proposals": (2, None, 20, ("model/sampler=proposal", *PROPOSAL, *PLANES)),
     # Stopped between two growths: the grid and the moments of another size are loaded.
-    "tineuvox": (
-        3,
-        23,
-        (
-            *("model=tineuvox_s", *TINEUVOX, "model.network_learning_rate=0.004"),
-            "trainer.max_steps=34",
-        ),
-    ),
+    "tineuvox": (3, 23, 34, ("model=tineuvox_s", *TINEUVOX, "model.network_learning_rate=0.004")),
     # Stopped when the fine level has joined, and planes are still averaged down.
-    "tensor4d": (
-        1.5,
-        13,
-        (
-            *("model=tensor4d", *TENSOR4D, *NEUS, *under("model", fine_from=6, blur_until=15)),
-            "trainer.max_steps=20",
-        ),
-    ),
-    "tensor4d_density": (
-        1.5,
-        None,
-        (
-            *("model=tensor4d_density", *TENSOR4D, *OCCUPANCY, "trainer.max_steps=20"),
-            *under("model.rays", per_batch=128, samples_per_batch=1024),
-        ),
-    ),
+    "tensor4d": (1.5, 13, 20, ("model=tensor4d", *TENSOR4D, *NEUS, *SOON)),
+    "tensor4d_density": (1.5, None, 20, ("model=tensor4d_density", *TENSOR4D, *CELLS)),
 }
-"""Least gain in dB, the step at which another run fails and is resumed, and the overrides."""
-
-
-def scores(folder):
-    return [float(row["psnr"]) for row in read_rows(folder / "curve.csv")]
+"""Least gain in dB, the step at which another run fails and is resumed, steps, and overrides."""
 
 
 def check_run(scenes, folder, gain, stop, overrides):
@@ -95,7 +62,9 @@ def check_run(scenes, folder, gain, stop, overrides):
 
 @pytest.mark.parametrize("name", RUNS)
 def test_a_run_learns_resumes_to_the_same_bits_and_is_loaded(scenes, tmp_path, name):
-    trained, whole = check_run(scenes, tmp_path, *RUNS[name])
+    gain, stop, steps, overrides = RUNS[name]
+    overrides = (*overrides, f"trainer.max_steps={steps}")
+    trained, whole = check_run(scenes, tmp_path, gain, stop, overrides)
     assert metrics(whole)["samples_per_ray"] > 0
     field = trained.module.field
     if name == "kplanes":

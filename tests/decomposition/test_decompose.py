@@ -29,25 +29,17 @@ def test_each_orientation_is_its_own_matrix():
             assert parts.reports[name][key] == expected
 
 
-def test_parts_have_the_shape_of_the_input_and_add_up():
-    triplanes = sequence()
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32, torch.float64])
+def test_parts_have_the_shape_of_the_input_and_add_up(dtype):
+    triplanes = sequence(width=20).to(dtype)[..., ::2]
     copy = triplanes.clone()
     parts = decompose(triplanes, sparsity_weight="auto", tolerance=1e-5)
     assert parts.low_rank.shape == parts.sparse.shape == triplanes.shape
+    assert parts.low_rank.dtype == (dtype if dtype == torch.float64 else torch.float32)
     assert parts.low_rank.is_contiguous()
     gap = (parts.low_rank + parts.sparse - triplanes).norm()
     assert gap < 1e-5 * triplanes.norm()
     assert torch.equal(triplanes, copy)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
-def test_types_and_strides(dtype):
-    solve = functools.partial(decompose, sparsity_weight="auto")
-    parts = solve(sequence().to(dtype))
-    assert parts.low_rank.dtype == (dtype if dtype == torch.float64 else torch.float32)
-    strided = sequence(width=20).to(dtype)[..., ::2]
-    same = solve(strided.contiguous())
-    assert torch.allclose(solve(strided).sparse, same.sparse, atol=1e-5)
 
 
 def test_refuses_other_shapes_and_says_what_is_wrong_in_the_values():

@@ -5,7 +5,7 @@ import torch
 
 from tests.refusals import assert_refused
 from xplanes.decomposition import time_planes, unexplained_energy
-from xplanes.decomposition.conversion import _joined, rank1_factors
+from xplanes.decomposition.conversion import rank1_factors
 from xplanes.fields.xplanes import PLANE_SETS, TIME_PLANES
 
 
@@ -63,18 +63,22 @@ def test_rank_one_explains_more_than_random_initialisation():
         assert left["rank1"] < 0.6, plane_set
 
 
+SEVEN = ((0, 1), (0, 2), (3, 2))
+"""A second yt."""
+
 FURTHER = {
-    "six": PLANE_SETS["six"],
-    "nine": PLANE_SETS["nine"],
-    "seven": ((0, 1), (0, 2), (3, 2)),  # A second yt.
-    "eight": ((0, 1), (2, 3), (4, 3)),  # Only zt is shared; xy has a pair of its own.
-    "swapped": ((2, 0), (2, 1), (0, 1)),  # six in another storage order
+    "six": (PLANE_SETS["six"], [{0, 1, 2}]),
+    "nine": (PLANE_SETS["nine"], [{0, 1}, {2, 3}, {4, 5}]),
+    "seven": (SEVEN, [{0, 1, 2, 3}]),
+    "eight": (((0, 1), (2, 3), (4, 3)), [{0, 1}, {2, 3, 4}]),  # Only zt is shared.
+    "swapped": (((2, 0), (2, 1), (0, 1)), [{0, 1, 2}]),  # six in another storage order
 }
+"""Rows of sets of planes, and which planes their products join."""
 
 
 @pytest.mark.parametrize("plane_set", FURTHER)
 def test_plane_sets_and_those_of_others_recover_their_factors(monkeypatch, plane_set):
-    rows = FURTHER[plane_set]
+    rows, joined = FURTHER[plane_set]
     count = 1 + max(place for pair in rows for place in pair)
     monkeypatch.setitem(PLANE_SETS, plane_set, rows)
     monkeypatch.setitem(TIME_PLANES, plane_set, tuple(f"plane {n}" for n in range(count)))
@@ -86,7 +90,7 @@ def test_plane_sets_and_those_of_others_recover_their_factors(monkeypatch, plane
     assert unexplained_energy(planes, sparse, rows=rows) < 1e-6
     # Halfway between frames too: signs do not jump.
     blend = time_planes(sparse.abs(), plane_set=plane_set, noise=0)
-    for group in _joined(rows):
+    for group in joined:
         agreement = sum((blend[p, 1:] * blend[p, :-1]).sum(1) for p in group)
         assert (agreement >= -1e-12).all()
 
@@ -94,9 +98,9 @@ def test_plane_sets_and_those_of_others_recover_their_factors(monkeypatch, plane
 def test_planes_without_a_product_and_without_a_name_are_refused(monkeypatch):
     for rows, names in [
         (((0, 1), (0, 2), (4, 2)), "xt yt zt wt yt'"),
-        (FURTHER["seven"], "xt yt zt"),
-        (FURTHER["seven"], "xt yt zt yt' more"),
-        (FURTHER["seven"], ""),
+        (SEVEN, "xt yt zt"),
+        (SEVEN, "xt yt zt yt' more"),
+        (SEVEN, ""),
     ]:
         monkeypatch.setitem(PLANE_SETS, "own", rows)
         monkeypatch.setitem(TIME_PLANES, "own", tuple(names.split()))
@@ -104,14 +108,6 @@ def test_planes_without_a_product_and_without_a_name_are_refused(monkeypatch):
             call = functools.partial(time_planes, moving(), plane_set="own", dynamic=dynamic)
             words = rf"plane_set='own'.*TIME_PLANES names {len(names.split())}"
             assert_refused(ValueError, words, call, (rows, names))
-
-
-def test_factors_that_products_join_flip_together():
-    assert _joined(PLANE_SETS["six"]) == [{0, 1, 2}]
-    assert _joined(PLANE_SETS["nine"]) == [{0, 1}, {2, 3}, {4, 5}]
-    assert _joined(FURTHER["seven"]) == [{0, 1, 2, 3}]
-    assert _joined(FURTHER["eight"]) == [{0, 1}, {2, 3, 4}]
-    assert _joined(((0, 1), (2, 3), (1, 2))) == [{0, 1, 2, 3}]
 
 
 def test_nothing_moves():

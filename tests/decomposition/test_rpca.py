@@ -1,9 +1,10 @@
 import functools
-import warnings
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from rpca_oracle import objective, oracle, plain_admm, relative
 
 from tests.refusals import assert_refused
@@ -39,12 +40,11 @@ def test_agrees_with_the_oracle(weight, method):
     assert abs(objective(result.low_rank, matrix, weight) / best - 1) < 1e-5
 
 
+@pytest.mark.filterwarnings("ignore:.*raise max_iterations")
 def test_the_fused_passes_repeat_the_plain_iteration():
     matrix = mixture()
     options = {"sparsity_weight": 0.05, "penalty": 0.1, "tolerance": 1e-15, "max_iterations": 9}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        fused = robust_pca(matrix, method="admm", scale="none", **options)
+    fused = robust_pca(matrix, method="admm", scale="none", **options)
     low, sparse, rank = plain_admm(matrix, weight=0.05, penalty=0.1, iterations=9)
     assert torch.allclose(low, fused.low_rank, atol=1e-9)
     assert torch.allclose(sparse, fused.sparse, atol=1e-9)
@@ -199,3 +199,33 @@ def test_reduced_precision_settings_do_not_leak_in_or_out():
     finally:
         torch.set_float32_matmul_precision(before)
     assert torch.equal(plain.low_rank, guarded.low_rank)
+
+
+@st.composite
+def matrices(draw):
+    rows, columns = draw(st.integers(2, 60)), draw(st.integers(1, 12))
+    generator = torch.Generator().manual_seed(draw(st.integers(0, 2**20)))
+    rank = draw(st.integers(0, min(columns, 4)))
+    low = torch.randn(rows, rank, generator=generator, dtype=torch.float64) @ torch.randn(
+        rank, columns, generator=generator, dtype=torch.float64
+    )
+    hit = torch.rand(rows, columns, generator=generator) < draw(st.sampled_from([0.0, 0.1, 0.5]))
+    noise = draw(st.sampled_from([0.0, 1e-6, 0.1]))
+    return low + (5.0 * hit + noise) * torch.randn(
+        rows, columns, generator=generator, dtype=torch.float64
+    )
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(matrices(), st.sampled_from([0.01, 0.1, 0.3, "auto"]))
+def test_parts_add_up_and_no_trivial_split_is_better(matrix, weight):
+    tight = {"tolerance": 1e-6, "max_iterations": 3000, "progress": False}
+    result = robust_pca(matrix, sparsity_weight=weight, **tight)
+    gap = (result.low_rank + result.sparse - matrix).norm()
+    assert result.converged
+    assert gap <= 1.001e-6 * matrix.norm()
+    assert torch.isfinite(result.low_rank).all()
+    assert torch.isfinite(result.sparse).all()
+    used = result.sparsity_weight
+    splits = (objective(part, matrix, used) for part in (torch.zeros_like(matrix), matrix))
+    assert objective(result.low_rank, matrix, used) <= min(splits) * (1 + 1e-4) + 1e-12

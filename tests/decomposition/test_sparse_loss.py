@@ -136,6 +136,9 @@ def test_one_frame_and_half_precision_targets():
 def test_the_sparse_part_follows_the_planes_and_nothing_waits_for_a_value():
     """On the device "meta" tensors have no values: asking for one raises."""
     planes, sparse = example("six")
-    term, planes = SparseProduct(sparse, PLANE_SETS["six"], 2), planes.to("meta")
+    term = SparseProduct(sparse, PLANE_SETS["six"], 2)
+    term.value(planes.float())
+    assert term.sparse.dtype == torch.float32
+    planes = planes.to("meta")
     term.add_gradient(torch.empty_like(planes), planes, 1.0, torch.Generator())
     assert term.sparse.device.type == "meta"

@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
-from tests.training.runs import small_config
-from xplanes.files import MARK, read_rows
+from tests.training.runs import outcome, small_config
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -30,12 +28,8 @@ class Tally:
     """Counts of one test; its docstring names the fault."""
 
     def __init__(self, kind: str) -> None:
-        self.content: dict[str, Any] = {
-            "kind": kind.strip().rstrip("."),
-            "cases": 0,
-            "recovered": 0,
-            "said": 0,
-        }
+        counts = dict.fromkeys(("cases", "recovered", "said"), 0)
+        self.content: dict[str, Any] = {"kind": kind.strip().rstrip("."), **counts}
 
     def recovered(self) -> None:
         """Count a case that came to what it would have come to without the fault."""
@@ -125,25 +119,6 @@ def config_of(root: Path, lrm: str, cache: Path | None, *overrides: str) -> dict
     place = f"preparation.cache={'null' if cache is None else cache}"
     wide = ("model.channels=32", "model.decoder.width=64") if lrm == "tiny" else ()
     return small_config(root / "scenes", *SETTINGS, *wide, f"lrm={lrm}", place, *overrides)
-
-
-def outcome(folder: Path) -> dict[str, Any]:
-    """All of a finished run that the clock does not touch."""
-    content = json.loads((folder / "metrics.json").read_text())
-    assert json.loads((folder / "run.json").read_text())["status"] == "finished"
-    assert not list(folder.rglob(f".*{MARK}*"))
-    names = ("test", "views", "step", "skipped", "samples_per_ray", "parameters")
-    return {name: content[name] for name in names} | {
-        "curve": [(row["step"], row["psnr"]) for row in read_rows(folder / "curve.csv")],
-        **{name: state(folder, name) for name in ("last", "best")},
-    }
-
-
-def state(folder: Path, name: str) -> dict[str, Any]:
-    """Parameters and step of a checkpoint, as builtins that compare exactly."""
-    content = torch.load(folder / "checkpoints" / f"{name}.ckpt", weights_only=True)
-    tensors = {key: value.tolist() for key, value in content["state_dict"].items()}
-    return {"step": content["global_step"], **tensors}
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.conftest import config_of, outcome
+from tests.faults.conftest import config_of
+from tests.training.runs import outcome
 from xplanes.files import StorageError
 from xplanes.launch import prepare
 from xplanes.training.checkpoints import load_checkpoint

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.conftest import Child, config_of, outcome
+from tests.faults.conftest import Child, config_of
+from tests.training.runs import outcome
 from xplanes.files import MARK
 from xplanes.training.checkpoints import load_checkpoint
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.conftest import Nursery, config_of, outcome
+from tests.faults.conftest import Nursery, config_of
+from tests.training.runs import outcome
 from xplanes.files import read_rows
 from xplanes.locks import RUN_LOCK
 

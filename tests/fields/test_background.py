@@ -66,6 +66,11 @@ def test_contraction_is_the_formula_and_keeps_the_unit_ball_or_cube(function, le
     assert (length(found) < 2 + 1e-6).all()
 
 
+def settings_of(**changes):
+    known = yaml.safe_load((CONF / "model" / "six_planes.yaml").read_text())["background"]
+    return BackgroundSettings(**known | changes)
+
+
 def exit_of(origin, direction):
     """Where a ray leaves the cube; None if it misses it."""
     near, far = 0.0, math.inf
@@ -104,13 +109,6 @@ def test_rays_are_composited_from_the_cube_to_infinity(samples, jittered):
     assert 3 < misses < 30
 
 
-class Before:
-    """A field's background, and nothing else of it."""
-
-    def __init__(self, background):
-        self.background = background
-
-
 def test_rays_without_light_left_look_no_further():
     background = world()
     origins, directions = some_rays(30)
@@ -119,24 +117,26 @@ def test_rays_without_light_left_look_no_further():
     seen = []
     background.decoder.register_forward_hook(lambda *given: seen.append(len(given[2][0])))
     plain = torch.ones(3)
-    found = behind(Before(background), origins, directions, opacity, plain)
+    found = behind(SimpleNamespace(background=background), origins, directions, opacity, plain)
     whole = background_colour(background, origins, directions)
     stopped = opacity > 0.999
     assert seen == [6 * int((~stopped).sum()), 6 * 30]
     assert torch.equal(found[stopped], torch.zeros(int(stopped.sum()), 3))
     torch.testing.assert_close(found[~stopped], whole[~stopped])
-    assert behind(Before(None), origins, directions, opacity, plain) is plain
+    assert behind(SimpleNamespace(background=None), origins, directions, opacity, plain) is plain
     assert behind(lambda *_: None, origins, directions, opacity, plain) is plain
 
 
-def test_gradients_reach_the_background_and_are_zero_where_nothing_is_seen():
+@pytest.mark.parametrize("opacity", [0.0, 1.0])
+def test_gradients_reach_the_background_and_are_zero_where_nothing_is_seen(opacity):
     background = world()
-    origins, directions = some_rays(30)
-    behind(Before(background), origins, directions, torch.zeros(30), torch.ones(3)).sum().backward()
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in background.parameters())
-    background.zero_grad()
-    behind(Before(background), origins, directions, torch.ones(30), torch.ones(3)).sum().backward()
-    assert all(p.grad is not None and not p.grad.any() for p in background.parameters())
+    opacities = torch.full((30,), opacity)
+    behind(
+        SimpleNamespace(background=background), *some_rays(30), opacities, torch.ones(3)
+    ).sum().backward()
+    for parameter in background.parameters():
+        assert parameter.grad is not None
+        assert parameter.grad.any() == (opacity == 0)
 
 
 def optimizer_of(background):
@@ -186,8 +186,7 @@ def shown_elsewhere(weight):
     """What a background shows where no view looks, after most views have shown darkness."""
     with initial_values(3, Stream.BACKGROUND):
         background = Background(8, 32, width=32, samples=8, colour=torch.tensor([0.6, 0.3, 0.2]))
-    known = yaml.safe_load((CONF / "model" / "six_planes.yaml").read_text())["background"]
-    settings = BackgroundSettings(**known | {"unseen": weight})
+    settings = settings_of(unseen=weight)
     origins, directions = some_rays(600)
     origins = 0.1 * origins
     bright, other = directions[:, 1] > 0.9, directions[:, 0] < -0.9
@@ -217,8 +216,7 @@ def shown_elsewhere(weight):
 )
 def test_the_usual_colour_is_that_of_rays_that_pass(monkeypatch, opacity, shown, usual):
     monkeypatch.setattr(module, "background_colour", lambda _, origins, __: 0 * origins)
-    known = yaml.safe_load((CONF / "model" / "six_planes.yaml").read_text())["background"]
-    settings = BackgroundSettings(**known)
+    settings = settings_of()
     seen = None if shown is None else torch.tensor(shown)
     rendering: Any = SimpleNamespace(opacity=torch.tensor(opacity), shown=seen)
     rays = {"target": torch.tensor([0.2, 0.2, 0.5, 0.8, 0.9])[:, None].expand(-1, 3)}

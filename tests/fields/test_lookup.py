@@ -12,11 +12,7 @@ from tests.oracles import plane_features as oracle
 from xplanes.backend import threads
 from xplanes.fields import lookup
 from xplanes.fields import lookup_numba as cpu
-from xplanes.fields.lookup import (
-    plane_features,
-    plane_features_gpu,
-    plane_features_reference,
-)
+from xplanes.fields.lookup import plane_features, plane_features_gpu, plane_features_reference
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES
 
 TOLERANCE = {torch.float32: 2e-6, torch.float64: 1e-13}
@@ -122,21 +118,6 @@ def test_only_the_planes_that_ask_get_gradients(function, asking):
     function(*planes, *scattered(9, torch.float32), PLANE_SETS["six"]).sum().backward()
     assert planes[asking].grad.abs().max() > 0
     assert planes[1 - asking].grad is None
-
-
-def test_texel_centres_return_the_texels():
-    space, time = stacks("six", size=5, time_rows=4, time_size=5)
-    centre = -0.8 + 0.4 * torch.arange(5, dtype=torch.float64)
-    points = torch.stack([centre, centre.flip(0), centre], dim=-1)
-    value = plane_features(space, None, points, torch.zeros(5).double(), PLANE_SETS["six"])
-    step = torch.arange(5)
-    torch.testing.assert_close(value[:, 0], space[0, 4 - step, step])  # xy: rows y, columns x
-    torch.testing.assert_close(value[:, 1], space[1, step, step])
-    torch.testing.assert_close(value[:, 2], space[2, step, 4 - step])  # yz: rows z, columns y
-    rows = torch.arange(4, dtype=torch.float64) / 3
-    moving = plane_features(0 * space, time, points[:4], rows, PLANE_SETS["six"])
-    step = torch.arange(4)
-    torch.testing.assert_close(moving[:, 0], time[0, step, step] * time[1, step, 4 - step])
 
 
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")  # The interpreter's, on purpose.

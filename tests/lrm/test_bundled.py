@@ -9,6 +9,7 @@ import torch
 from safetensors.torch import save_file
 
 from tests.lrm.reduced import reduced
+from tests.refusals import flip
 from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.lrm import LRMError
@@ -40,13 +41,11 @@ def test_a_model_is_loaded_from_half_precision(tmp_path):
 
 def test_changed_weights_are_refused(tmp_path):
     path = ship(tmp_path, "tiny")
-    content = bytearray(path.read_bytes())
-    content[-5] ^= 1
-    path.write_bytes(content)
+    flip(path, -5)
     words = r"tiny\.safetensors is damaged or belongs to another model: its SHA-256"
     with pytest.raises(LRMError, match=words):
         load_bundled("tiny", tmp_path)
-    path.write_bytes(content[:-100])
+    path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(LRMError, match=r"tiny\.safetensors is damaged"):
         load_bundled("tiny", tmp_path)
 

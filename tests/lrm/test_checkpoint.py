@@ -9,6 +9,7 @@ from safetensors.torch import save_file
 
 from tests.lrm.reduced import CONFIGS, SIDES, published_shapes, reduced
 from tests.lrm.reference import FOLDER, compare
+from tests.refusals import Evil
 from xplanes.lrm import LRM, LRMError, load
 from xplanes.lrm.checkpoint import build, fill, mismatches
 from xplanes.lrm.config import PUBLISHED, parse_config, published_config
@@ -46,7 +47,7 @@ def test_every_published_form_of_file_loads(tmp_path, name, file):
     assert sum(p.numel() for p in model.parameters()) == sum(t.numel() for t in state.values())
 
 
-def test_encode_and_decode(models):
+def test_encoding_is_of_each_image_alone_and_in_bfloat16_too(models):
     for name, model in models.items():
         images = torch.rand(3, 3, SIDES[name], SIDES[name])
         triplanes = model.encode(images)
@@ -54,10 +55,6 @@ def test_encode_and_decode(models):
         assert triplanes.isfinite().all(), name
         assert not triplanes.requires_grad, name
         compare(model.encode(images[1:2]), triplanes[1:2], atol=1e-5, case=name)
-        rgb, density = model.decoder(torch.randn(10, 18))
-        assert rgb.shape == (10, 3), name
-        assert density.shape == (10,), name
-        assert (density > 0).all(), name
         with torch.autocast("cpu", torch.bfloat16):
             rough = model.encode(images).float()
         assert (rough - triplanes).norm() < 0.1 * triplanes.norm(), name
@@ -168,22 +165,14 @@ def test_configuration_inside_the_file_wins_for_a_published_name(tmp_path):
         load({"architecture": "openlrm-base-1.0"}, path)
 
 
-class Intruder:
-    def __reduce__(self):
-        return print, ("code was run",)
-
-
 CONTENTS = (
     *(
         (content, "no named weights")
         for content in ({"step": 3}, [1, 2], {}, {"weights": {"a": 1}})
     ),
-    ({"weights": Intruder()}, "never run"),
-    (pickle.dumps(Intruder(), protocol=2), "never run"),
-    *(
-        (content, r"model\.ckpt")
-        for content in (b"error", b"\x80\x02" + bytes(range(256)), bytes(64))
-    ),
+    ({"weights": Evil()}, "never run"),
+    (pickle.dumps(Evil(), protocol=2), "never run"),
+    (b"\x80\x02" + bytes(range(256)), r"model\.ckpt"),
 )
 
 

@@ -59,22 +59,6 @@ def test_openlrm_decodes_points():
             compare(density[:, None], truth["sigma"][scene], rtol=1e-3, case=case)
 
 
-def test_openlrm_from_an_image_to_densities_on_a_grid():
-    """Layout, decoder and encoder together."""
-    for version, size in (("1.0", 96), ("1.1", 56)):
-        folder = VERSIONS[version]
-        model, truth = load_reduced(folder), arrays(f"{folder}/grid.npz")
-        encoded = arrays(f"{folder}/encode_{size}.npz")
-        triplanes = model.encode(encoded["image"], encoded["camera"])
-        line = torch.linspace(-1, 1, int(truth["grid_size"]))
-        points = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), dim=-1).view(-1, 3)
-        for scene in range(2):
-            case = f"OpenLRM {version}, scene {scene}"
-            rgb, density = field_points(triplanes[scene], model.decoder, points)
-            compare(rgb, truth["rgb"][scene].view(-1, 3), case=case)
-            compare(density, truth["sigma"][scene].flatten(), rtol=1e-3, case=case)
-
-
 def test_triposr_encodes_images_to_triplanes():
     model, truth = load_reduced("triposr_tiny"), arrays("triposr_tiny/encode_native.npz")
     pictures = truth["image"].permute(2, 0, 1)[None]

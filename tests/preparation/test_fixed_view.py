@@ -11,8 +11,8 @@ import torch
 
 from tests.balls import ball_scene, ball_views, inside_ball, surrounding, swinging
 from tests.baselines.runs import KPLANES, PROPOSAL
-from tests.refusals import assert_refused
-from tests.training.runs import changed, small_config
+from tests.refusals import assert_refused, interrupt
+from tests.training.runs import SMALL, changed, small_config
 from tests.training.test_health import spoil_gradient
 from xplanes.errors import ConfigError, SceneError
 from xplanes.lrm.alignment import align
@@ -27,15 +27,7 @@ from xplanes.scenes.frame import CubeHints, Frame, scene_frame
 from xplanes.training import fit as training
 from xplanes.training.module import RadianceModule, TrainingError
 
-SMALL_FIELD = (
-    "model.resolution=24",
-    "model.channels=8",
-    "model.decoder.width=32",
-    "model.sampler.grid_resolution=24",
-    "model.sampler.samples=64",
-    "model.sampler.update_cells=512",
-    "model.sampler.sweep_at=[15]",
-)
+SMALL_FIELD = tuple(text for text in SMALL if text.startswith("model."))
 TIMES = torch.linspace(0, 1, 50)
 VIEWS = {"openlrm": OPENLRM_VIEW, "triposr": TRIPOSR_VIEW}
 
@@ -48,12 +40,6 @@ def settings(folder: Path, *overrides: str) -> Method:
 
 def default_settings(*overrides: str) -> Method:
     return Method.read(changed(overrides))
-
-
-@pytest.fixture(autouse=True)
-def composed_once(monkeypatch):
-    """Composing takes a fifth of a second."""
-    monkeypatch.setattr(module, "compose_plain", lambda _, lines: changed(tuple(lines)))
 
 
 def video_of(method, scene, folder, size=24):
@@ -323,16 +309,11 @@ def test_a_field_renders_the_scene_and_the_video_is_cached(tmp_path, small_field
 def test_an_interrupted_field_is_resumed(tmp_path, small_fields, monkeypatch):
     scene, cache = ball_scene(count=12, size=24), tmp_path / "cache"
     method = settings(tmp_path, "preparation.fixed_view_steps=3")
-
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    original = module._render
-    monkeypatch.setattr(module, "_render", stop)
-    with pytest.raises(KeyboardInterrupt):
-        video_of(method, scene, cache)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_render", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            video_of(method, scene, cache)
     assert list(cache.glob("fixed_view-*/checkpoints/last.ckpt"))
-    monkeypatch.setattr(module, "_render", original)
     again = lambda *_: pytest.fail("a step that was done is done again")  # noqa: E731
     monkeypatch.setattr(RadianceModule, "training_step", again)
     video_of(method, scene, cache)

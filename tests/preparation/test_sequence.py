@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests.preparation.sequences import OPTIONS, moving_sequence
+from tests.refusals import Evil
 from xplanes.errors import ConfigError, SceneError
 from xplanes.fields import Decoder
 from xplanes.preparation import TriplaneSequence, load_triplanes, save_triplanes
@@ -48,11 +49,6 @@ def test_triplanes_alone_are_enough_and_a_view_of_a_larger_tensor_is_written_alo
         back = load_triplanes(tmp_path / name)
         assert (back.decoder, back.decoder_config, back.frame) == (None, None, None), name
     assert (tmp_path / "a.pt").stat().st_size < sequence.triplanes.numel() * 4 + 4096
-
-
-class Evil:
-    def __reduce__(self):
-        return print, ("code was run",)
 
 
 def in_file(content: object) -> bytes:

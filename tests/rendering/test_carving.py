@@ -20,11 +20,12 @@ def carved(views, *, resolution=24, bins=4, frame=None):
     return grid
 
 
-def allowed_at(grid, points, time):
-    """Whether the cells of points in the field's frame are allowed at a time."""
+def allowed_at(grid, points, time, among=None):
+    """Whether the cells of points in the field's frame are ``among`` others at a time."""
     x, y, z = ((points + 1) / 2 * grid.resolution).floor().long().unbind(dim=-1)
     shape = (grid.time_bins, *[grid.resolution] * 3)
-    return grid.allowed.view(shape)[int(grid.bins(torch.tensor([time]))), z, y, x]
+    among = grid.allowed if among is None else among
+    return among.view(shape)[int(grid.bins(torch.tensor([time]))), z, y, x]
 
 
 @pytest.mark.parametrize("size", [24, 64])
@@ -54,11 +55,7 @@ def test_content_close_to_wide_cameras_is_kept(distance):
 
 @pytest.mark.parametrize(
     ("count", "radius", "turns", "share"),
-    [
-        (50, 0.4, 0.25, 0.0),
-        (50, 0.3, 1, 0.0005),
-        (200, 0.15, 2, 0.001),
-    ],
+    [(50, 0.4, 0.25, 0.0), (50, 0.3, 1, 0.0005), (200, 0.15, 2, 0.001)],
 )
 def test_a_moving_ball_is_never_ruled_out_and_most_else_is_empty(count, radius, turns, share):
     # In the span over which content counts as static, with 50 views, the slow ball moves by

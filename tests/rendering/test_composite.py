@@ -156,10 +156,17 @@ def at_every_density(dtype):
     return depth, *rest
 
 
-@pytest.mark.parametrize("dtype", FLOATS)
-def test_loops_and_twin_agree_at_every_density(dtype):
+EVERY_DENSITY = [(composite, dtype, 1e-5) for dtype in FLOATS]
+EVERY_DENSITY += [(kernels, torch.float32, 1e-6)] if triton else []
+
+
+@pytest.mark.parametrize(("merge", "dtype", "most"), EVERY_DENSITY)
+def test_loops_and_kernels_agree_with_the_twin_at_every_density(merge, dtype, most):
     given = at_every_density(dtype)
-    agree(*(values_and_gradients(merge, *given) for merge in PLAIN), atol=2e-5, rtol=1e-5)
+    found = values_and_gradients(merge, *given)
+    expected = values_and_gradients(composite_reference, *doubled(given))
+    assert all(part.isfinite().all() for part in found)
+    agree(found, expected, atol=most, rtol=most)
 
 
 @of_each
@@ -258,12 +265,3 @@ def test_places_without_a_sample_change_nothing_and_get_nothing(last):
         agree(kept, expected, atol=1e-12, rtol=0)
         assert not any(part[given:].any() for part in (found[1], found[3]))
     assert not values_and_gradients(some, *padded)[2][given:].any()
-
-
-@needs_triton
-def test_kernels_agree_with_the_twin_at_every_density():
-    given = at_every_density(torch.float32)
-    found = values_and_gradients(kernels, *given)
-    expected = values_and_gradients(composite_reference, *doubled(given))
-    assert all(part.isfinite().all() for part in found)
-    agree(found, expected, atol=1e-6, rtol=1e-6)

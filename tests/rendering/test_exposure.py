@@ -1,21 +1,17 @@
 """Exposures of cameras: gains that are learnt, used in training alone, and stored."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
-from tests.training.runs import small_config, train_quietly
-from tests.training.test_surroundings import built, scene
-from xplanes import RadianceModule
+from tests.training.test_surroundings import built
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.exposure import ExposureSampler
 from xplanes.rendering.sampler import Sampler
 from xplanes.scenes.frame import CameraGroups
 from xplanes.streams import TrainingState
-from xplanes.training import building
 
 GAINS = torch.tensor([[0.8, 1.0, 1.1], [1.25, 1.0, 1.0], [1.0, 1.0, 1 / 1.1]])
 """Three cameras whose geometric mean is 1 in each channel."""
@@ -83,22 +79,3 @@ def test_exposures_are_matched_where_images_show_surroundings(kind, overrides, m
     module = built(kind, *overrides)
     assert ("exposures" in module.sampler.modules) == matched
     assert ("exposures.logarithms" in module.state_dict()) == matched
-
-
-@pytest.mark.slow
-def test_photos_of_different_exposure_are_told_apart(monkeypatch, tmp_path):
-    monkeypatch.setattr(building, "EXPOSURE_START", 20)
-    given, dark = scene("world"), torch.arange(12) % 2 == 0
-    views = given.splits["train"]
-    assert isinstance(views.images, torch.Tensor)
-    images = views.images.clone()
-    images[dark, ..., :3] = (images[dark, ..., :3] * 0.7).to(torch.uint8)
-    photos = replace(given, splits=given.splits | {"train": replace(views, images=images)})
-    module = RadianceModule(small_config(tmp_path, "model.rays.per_batch=512"))
-    module.build(photos)
-    train_quietly(module, photos, tmp_path, 150).save_checkpoint(tmp_path / "last.ckpt")
-    gains = module.sampler.modules["exposures"](torch.arange(12)).detach()
-    assert gains[dark].mean(dim=1).max() < gains[~dark].mean(dim=1).min()
-    torch.testing.assert_close(gains.log().mean(dim=0), torch.zeros(3))
-    loaded = RadianceModule.load_from_checkpoint(tmp_path / "last.ckpt")
-    assert torch.equal(loaded.sampler.modules["exposures"](torch.arange(12)), gains)

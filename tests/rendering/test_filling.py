@@ -37,10 +37,7 @@ def filled(views, field, *, resolution=20, bins=4):
 
 
 def occupied_at(grid, points, time):
-    grid.allowed, allowed = grid.occupied, grid.allowed
-    found = allowed_at(grid, points, time)
-    grid.allowed = allowed
-    return found
+    return allowed_at(grid, points, time, grid.occupied)
 
 
 def static(_):

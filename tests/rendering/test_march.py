@@ -65,11 +65,7 @@ def details(grid, *, step=STEP, skip_empty=True, occlusion=0.0, **options):
     return {"step": step, "occupied": occupied, "limit": limit, **options}
 
 
-def twin(rays, grid, **options):
-    return march_reference(Rays(*rays), grid, **details(grid, **options))
-
-
-def into(rays, grid, room, **options):
+def twin(rays, grid, room=None, **options):
     return march_reference(Rays(*rays), grid, room=room, **details(grid, **options))
 
 
@@ -85,22 +81,14 @@ def by_kernel(rays, grid, room=None, **options):
 of_each = pytest.mark.parametrize("take", [loops, twin, *([by_kernel] if triton else [])])
 
 
-def by_oracle(rays, grid, *, step=STEP, skip_empty=True, occlusion=0.0):
-    shape = (grid.time_bins, *[grid.resolution] * 3)
-    return oracle(
-        *(ray.double().numpy() for ray in rays),
-        grid.occupied.view(shape).numpy(),
-        grid.least.view(shape).double().numpy(),
-        step=step,
-        skip=skip_empty,
-        occlusion=occlusion,
-    )
-
-
-def as_the_oracle(rays, grid, **options):
+def as_the_oracle(rays, grid, *, skip_empty=True, **options):
     """Loops and twin take the samples of the oracle, whose counts are returned."""
-    kept, counts = by_oracle(rays, grid, **options)
-    for found in (loops(rays, grid, **options), twin(rays, grid, **options)):
+    shape = (grid.time_bins, *[grid.resolution] * 3)
+    cells = (cells.view(shape).double().numpy() for cells in (grid.occupied, grid.least))
+    given = {"step": STEP, "occlusion": 0.0, **options}
+    kept, counts = oracle(*(ray.double().numpy() for ray in rays), *cells, skip=skip_empty, **given)
+    for take in (loops, twin):
+        found = take(rays, grid, skip_empty=skip_empty, **options)
         assert found.ray.tolist() == [row[0] for row in kept]
         assert found.cells.tolist() == [row[2] for row in kept]
         np.testing.assert_allclose(found.distances, [row[1] for row in kept], atol=1e-12)
@@ -126,30 +114,22 @@ def test_samples_equal_the_loops_of_the_oracle(skip, occlusion):
 
 def test_in_float32_only_samples_on_borders_differ():
     grid, rays = grid_of(17, 5, filled=1.1), rays_of(1000, torch.float32)
-    ours, theirs = loops(rays, grid), twin(rays, grid)
-    for found in (ours, theirs):
-        assert found.candidates == found.empty + found.occluded + len(found)
-        assert (found.ray.diff() >= 0).all()
-        assert found.points.dtype == found.distances.dtype == torch.float32
-    near = near_of(rays)
-    numbers = [
-        {(r, round(d / STEP - j)): n for n, (r, d, j) in enumerate(zip(*x, strict=True))}
-        for x in (
-            [v.tolist() for v in (s.ray, s.distances - near[s.ray], rays[3][s.ray])]
-            for s in (ours, theirs)
-        )
-    ]
-    for key in set(numbers[0]) ^ set(numbers[1]):
-        samples = (ours, theirs)[key not in numbers[0]]
-        point = samples.points[numbers[key not in numbers[0]][key]]
-        assert abs(float(point.abs().max()) - 1) < 1e-5
-    shared = sorted(set(numbers[0]) & set(numbers[1]))
-    assert len(shared) > 15_000
-    first = torch.tensor([numbers[0][key] for key in shared])
-    second = torch.tensor([numbers[1][key] for key in shared])
-    torch.testing.assert_close(ours.points[first], theirs.points[second], atol=2e-6, rtol=0)
-    other = ours.cells[first] != theirs.cells[second]
-    place = (ours.points[first][other] + 1) * (grid.resolution / 2)
+    near, found, places = near_of(rays), [take(rays, grid) for take in (loops, twin)], []
+    for samples in found:
+        assert samples.candidates == samples.empty + samples.occluded + len(samples)
+        assert (samples.ray.diff() >= 0).all()
+        assert samples.points.dtype == samples.distances.dtype == torch.float32
+        steps = (samples.distances - near[samples.ray]) / STEP - rays[3][samples.ray]
+        places.append(1000 * samples.ray + steps.round().long())
+    shared = torch.isin(*places), torch.isin(*reversed(places))
+    kept = list(zip(found, shared, strict=True))
+    for samples, alike in kept:
+        assert ((samples.points[~alike].abs().amax(dim=1) - 1).abs() < 1e-5).all()
+    points, cells = [s.points[alike] for s, alike in kept], [s.cells[alike] for s, alike in kept]
+    assert len(points[0]) > 15_000
+    torch.testing.assert_close(*points, atol=2e-6, rtol=0)
+    other = cells[0] != cells[1]
+    place = (points[0][other] + 1) * (grid.resolution / 2)
     assert ((place - place.round()).abs().amin(dim=-1) < 1e-4).all()
     assert other.float().mean() < 1e-4
 
@@ -205,7 +185,7 @@ def test_any_grid_and_step(resolution, bins, step, occlusion, skip, seed):
 def test_a_fixed_number_of_places_takes_the_same_samples(skip, occlusion, dtype):
     grid, rays = grid_of(), rays_of(60, dtype)
     expected = twin(rays, grid, skip_empty=skip, occlusion=occlusion)
-    found = into(rays, grid, len(expected) + 30, skip_empty=skip, occlusion=occlusion)
+    found = twin(rays, grid, len(expected) + 30, skip_empty=skip, occlusion=occlusion)
     live = found.live
     assert live.sum() == found.count == len(expected)
     assert not live[len(expected) :].any()
@@ -225,7 +205,7 @@ def test_rays_without_room_are_left_out_whole(share):
     grid, rays = grid_of(), rays_of(60)
     whole = twin(rays, grid)
     room = int(share * len(whole))
-    found = into(rays, grid, room)
+    found = twin(rays, grid, room)
     shown = found.shown
     assert bool(shown.all()) == (room == len(whole))
     kept = shown[whole.ray]
@@ -259,7 +239,7 @@ def test_the_kernel_fills_a_fixed_number_of_places_as_the_twin_does(dtype, share
     number = len(twin(rays, grid, occlusion=0.001))
     assert number > 20
     found, expected = (
-        take(rays, grid, room=int(share * number), occlusion=0.001) for take in (by_kernel, into)
+        take(rays, grid, room=int(share * number), occlusion=0.001) for take in (by_kernel, twin)
     )
     same_places(found, expected)
 

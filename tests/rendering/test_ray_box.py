@@ -6,13 +6,16 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from tests.oracles import ray_box as oracle
 from xplanes.rendering.box import ray_box
 
 NAN, INF = math.nan, math.inf
+
+TURNS = list(
+    itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3))
+)
+"""Orders and signs of axes."""
 
 
 def one(origin, direction, **options):
@@ -24,7 +27,7 @@ def one(origin, direction, **options):
     return float(near), float(far)
 
 
-def test_known_rays():
+def test_known_rays_whichever_way_they_are_turned():
     for origin, direction, expected in [
         ((0, 0, 4), (0, 0, -1), (3, 5)),
         ((0, 0, 4), (0, 0, 1), (0, 0)),  # points away
@@ -33,7 +36,6 @@ def test_known_rays():
         ((1, 0, 0), (-1, 0, 0), (0, 2)),  # on a face, going in
         ((1, 0, 0), (1, 0, 0), (0, 0)),  # on a face, going out
         ((1, 0, -3), (0, 0, 1), (2, 4)),  # along a face
-        ((-1, 0, -3), (0, 0, 1), (2, 4)),
         ((1, -1, -3), (0, 0, 1), (2, 4)),  # along an edge
         ((1.0001, 0, -3), (0, 0, 1), (0, 0)),  # just beside a face
         ((1, 1, 1), (-1, -1, -1), (0, 2)),  # from a corner through the middle
@@ -46,8 +48,11 @@ def test_known_rays():
         ((0, 0, 4), (-0.0, -0.0, -1), (3, 5)),
         ((1, 0, -3), (-0.0, 0, 1), (2, 4)),
     ]:
-        case = f"from {origin} to {direction}"
-        assert one(origin, direction) == pytest.approx(expected), case
+        for order, signs in TURNS:
+            turned = [
+                [s * v[i] for i, s in zip(order, signs, strict=True)] for v in (origin, direction)
+            ]
+            assert one(*turned) == pytest.approx(expected), f"from {turned[0]} to {turned[1]}"
 
 
 @pytest.mark.parametrize("bad", [NAN, INF, -INF, 3e38, -3e38])
@@ -84,20 +89,3 @@ def test_random_rays_equal_the_loops_of_the_oracle():
     expected = np.array([oracle(o, d) for o, d in zip(origins, directions, strict=True)])
     np.testing.assert_allclose(np.stack([near, far], axis=-1), expected, atol=1e-9)
     assert 0.2 < (expected[:, 1] > 0).mean() < 0.95
-
-
-COORDINATE = st.floats(-3, 3, width=32) | st.sampled_from([-1.0, 0.0, 1.0, -0.0])
-VECTOR = st.tuples(COORDINATE, COORDINATE, COORDINATE)
-
-
-@settings(max_examples=60, deadline=None)
-@given(origin=VECTOR, direction=VECTOR)
-def test_flipped_and_swapped_axes_change_nothing(origin, direction):
-    origins, directions = [], []
-    for signs in itertools.product((1, -1), repeat=3):
-        for order in itertools.permutations(range(3)):
-            origins.append([signs[i] * origin[order[i]] for i in range(3)])
-            directions.append([signs[i] * direction[order[i]] for i in range(3)])
-    near, far = ray_box(torch.tensor(origins), torch.tensor(directions))
-    assert (near == near[0]).all()
-    assert (far == far[0]).all()

@@ -175,32 +175,23 @@ def test_rays_that_say_nothing_move_nothing():
     # Pixels of a fisheye lens beside the last one with a ray.
     same = rays | {"across": torch.zeros_like(rays["across"])}
     lost = torch.full_like(one, torch.nan)
+    # Rays without slots for their samples.
+    none = torch.empty(0, dtype=torch.int64)
+    left_out = Samples(none, none, torch.empty(0, 3), none, none, 0, 0, 0, shown=one == 0)
     cases = (
-        (rays, torch.full_like(target, torch.nan), one),
-        (rays, target, one),
-        (same, target / 2, one),
-        (rays, target / 2, lost),
+        (rays, torch.full_like(target, torch.nan), one, None),
+        (rays, target, one, None),
+        (same, target / 2, one, None),
+        (rays, target / 2, lost, None),
+        (rays, target / 2, one, left_out),
     )
-    for drawn, colour, opacity in cases:
-        cameras.observe(drawn, Rendering(colour, opacity, one, one, None))  # pyright: ignore
+    for drawn, colour, opacity, samples in cases:
+        cameras.observe(drawn, Rendering(colour, opacity, one, one, samples))  # pyright: ignore
         cameras.solve()
         assert torch.equal(cameras.motion, torch.zeros(4, 6))
     cameras.observe(rays, Rendering(target / 2, one, one, one, None))  # pyright: ignore
     cameras.solve()
     assert (cameras.motion != 0).any(dim=1).all(), "what said nothing has done no harm"
-
-
-def test_rays_without_slots_for_their_samples_do_not_count():
-    views = views_of(surrounding(4, 4.0))
-    cameras = CameraCorrections(CameraGroups.of(views, FRAME))
-    rays = batches_of(views).draw(0)
-    colour, opacity, depth = ball(rays["origins"], rays["directions"])
-    none = torch.empty(0, dtype=torch.int64)
-    left_out = torch.zeros(len(colour), dtype=torch.bool)
-    samples = Samples(none, none, torch.empty(0, 3), none, none, 0, 0, 0, shown=left_out)
-    cameras.observe(rays, Rendering(1 - colour, opacity, depth, torch.empty(0), samples))
-    assert not cameras.steepness.any()
-    assert not cameras.residual.any()
 
 
 def test_cameras_that_few_rays_show_are_corrected_in_the_end():

@@ -16,13 +16,8 @@ class Tally:
     """What became of the cases of one test; the test's docstring names the kind of stress."""
 
     def __init__(self, kind: str) -> None:
-        self.content: dict[str, Any] = {
-            "kind": kind.strip().rstrip("."),
-            "cases": 0,
-            "finite": 0,
-            "diagnosed": 0,
-            "error": None,
-        }
+        counts = {"cases": 0, "finite": 0, "diagnosed": 0, "error": None}
+        self.content: dict[str, Any] = {"kind": kind.strip().rstrip("."), **counts}
 
     def finite(self, *tensors: Tensor | float | None) -> None:
         """Count a case, all of whose tensors must be finite."""

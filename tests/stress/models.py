@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX
+from tests.baselines.runs import KPLANES, NEUS, PROPOSAL, TENSOR4D, TINEUVOX, under
 from xplanes.config import compose_plain
 from xplanes.experiment import Experiment
 from xplanes.run import run
@@ -15,13 +15,8 @@ from xplanes.scenes.frame import CubeHints
 from xplanes.training.module import RadianceModule
 
 XPLANES = (
-    "model.resolution=16",
-    "model.channels=8",
-    "model.decoder.width=32",
-    "model.sampler.grid_resolution=16",
-    "model.sampler.samples=48",
-    "model.sampler.update_cells=256",
-    "model.sampler.sweep_at=[15]",
+    *(*under("model", resolution=16, channels=8), "model.decoder.width=32"),
+    *under("model.sampler", grid_resolution=16, samples=48, update_cells=256, sweep_at=[15]),
     "model.rays.per_batch=128",
 )
 SMALLER = ("model.width=16", "model.rays.per_batch=32")
@@ -57,26 +52,12 @@ RATES = {
 def settings(model: str, scene: Path, *overrides: str, lrm: str = "none") -> dict[str, Any]:
     """The configuration of a small run."""
     steps = 15 if model in SLOW else 50
-    return compose_plain(
-        "train",
-        [
-            "data=dnerf",
-            f"data.root={scene.parent}",
-            f"data.scene={scene.name}",
-            "data.resolution=null",
-            f"model={model}",
-            f"lrm={lrm}",
-            *MODELS[model],
-            "trainer.accelerator=cpu",
-            "model.precision=32",
-            f"trainer.max_steps={steps}",
-            "trainer.max_seconds=null",
-            "callbacks.evaluation.at=[]",
-            "media=false",
-            "preparation.cache=null",
-            *overrides,
-        ],
-    )
+    scenes = under("data", root=scene.parent, scene=scene.name, resolution="null")
+    trainer = under("trainer", accelerator="cpu", max_steps=steps, max_seconds="null")
+    off = ("callbacks.evaluation.at=[]", "media=false", "preparation.cache=null")
+    chosen = ("data=dnerf", f"model={model}", f"lrm={lrm}", "model.precision=32")
+    given = (*chosen, *scenes, *MODELS[model], *trainer, *off, *overrides)
+    return compose_plain("train", list(given))
 
 
 def faster(model: str, factor: float) -> list[str]:

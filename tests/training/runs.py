@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from xplanes.config import CONF, to_plain
+from xplanes.files import MARK, read_rows
 from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Scene
@@ -25,27 +26,20 @@ from xplanes.training import fit
 from xplanes.training.clock import TrainingClock
 from xplanes.training.module import RadianceModule
 
+
+def under(group: str, **values: Any) -> tuple[str, ...]:
+    """Overrides of keys in a group."""
+    return tuple(f"{group}.{key}={value}" for key, value in values.items())
+
+
 SMALL = (
     "lrm=none",
-    "data.resolution=32",
-    "data.train_views=10",
-    "data.test_views=3",
-    "data.val_views=2",
-    "model.resolution=24",
-    "model.channels=8",
-    "model.decoder.width=32",
-    "model.sampler.grid_resolution=24",
-    "model.sampler.samples=64",
-    "model.sampler.update_cells=512",
-    "model.sampler.sweep_at=[15]",
-    "trainer.accelerator=cpu",
-    "model.rays.per_batch=256",
-    "model.rays.samples_per_batch=4096",
-    "trainer.max_seconds=null",
-    "trainer.max_steps=40",
-    "callbacks.checkpoints.every=10",
-    "callbacks.evaluation.at=[0,0.5]",
-    "media=false",
+    *under("data", resolution=32, train_views=10, test_views=3, val_views=2),
+    *(*under("model", resolution=24, channels=8), "model.decoder.width=32"),
+    *under("model.sampler", grid_resolution=24, samples=64, update_cells=512, sweep_at=[15]),
+    *under("model.rays", per_batch=256, samples_per_batch=4096),
+    *under("trainer", accelerator="cpu", max_seconds="null", max_steps=40),
+    *("callbacks.checkpoints.every=10", "callbacks.evaluation.at=[0,0.5]", "media=false"),
 )
 
 NO_CURVE = "callbacks.evaluation.at=[]"
@@ -126,6 +120,11 @@ def metrics(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "metrics.json").read_text())
 
 
+def scores(folder: Path) -> list[float]:
+    """PSNR of the evaluations of a run."""
+    return [float(row["psnr"]) for row in read_rows(folder / "curve.csv")]
+
+
 def status(folder: Path) -> dict[str, Any]:
     """What run.json of a run says."""
     return json.loads((folder / "run.json").read_text())
@@ -134,6 +133,21 @@ def status(folder: Path) -> dict[str, Any]:
 def checkpoint(folder: Path, name: str = "last") -> dict[str, Any]:
     """A checkpoint of a run."""
     return torch.load(folder / "checkpoints" / f"{name}.ckpt", weights_only=True)
+
+
+def outcome(folder: Path) -> dict[str, Any]:
+    """All of a finished run that the clock does not touch, as builtins that compare exactly."""
+    content = metrics(folder)
+    assert status(folder)["status"] == "finished"
+    assert not list(folder.rglob(f".*{MARK}*"))
+    names = ("test", "views", "step", "skipped", "samples_per_ray", "parameters")
+    found = {name: content[name] for name in (*names, "steps_skipped", "restarts")}
+    found["curve"] = [(row["step"], row["psnr"]) for row in read_rows(folder / "curve.csv")]
+    for path in (folder / "checkpoints").glob("*.ckpt"):
+        kept = checkpoint(folder, path.stem)
+        tensors = {name: value.tolist() for name, value in kept["state_dict"].items()}
+        found[path.stem] = {"step": kept["global_step"], **tensors}
+    return found
 
 
 def same_state(first: Mapping[str, Tensor], second: Mapping[str, Tensor]) -> None:

@@ -1,14 +1,12 @@
 """Runs initialised from the bundled model, the default of `python train.py`."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
 from tests.balls import ball_scene
-from tests.training.runs import UNSCORED, changed, composed, metrics
-from xplanes.files import read_rows
+from tests.training.runs import UNSCORED, changed, composed, metrics, scores
 from xplanes.lrm.weights import bundled_models
 from xplanes.models.initialisation import Initialisation, Method, Place
 from xplanes.preparation.sources import LRMInitialiser
@@ -24,11 +22,6 @@ SETTINGS = (
     "trainer.max_steps=12",
     "callbacks.evaluation.at=[0]",
 )
-
-
-def psnr(folder: Path) -> list[float]:
-    """PSNR at step 0 and at the end of a run."""
-    return [float(row["psnr"]) for row in read_rows(folder / "curve.csv")]
 
 
 def test_the_default_initialisation_is_a_bundled_model():
@@ -64,9 +57,9 @@ def test_without_a_video_only_an_lrm_that_is_asked_for_sees_a_scene(
 
 @pytest.mark.parametrize("name", ["auto", pytest.param("mini", marks=pytest.mark.slow)])
 def test_it_knows_the_scene_before_the_first_step(train, name):
-    random = psnr(train(*SETTINGS, "lrm=none", name="random"))
+    random = scores(train(*SETTINGS, "lrm=none", name="random"))
     folder = train(*SETTINGS, f"lrm={name}")
-    informed = psnr(folder)
+    informed = scores(folder)
     assert informed[0] > random[0] + 3
     assert informed[-1] > random[-1] + 1
     content = metrics(folder)

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import nn
 
-from tests.refusals import assert_refused
+from tests.refusals import assert_refused, flip
 from tests.training.runs import (
     UNSCORED,
     after_each_batch,
@@ -257,18 +257,14 @@ def test_a_resumed_run_takes_new_learning_rates(train, folder, monkeypatch):
     assert seen[0][1] == pytest.approx(10 * seen[0][0])
 
 
-def flipped(content: bytes) -> bytes:
-    place = len(content) // 2
-    return content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :]
-
-
 def test_a_damaged_checkpoint_gives_way_to_the_best(train, whole, folder, caplog):
     last, best = (folder / "checkpoints" / f"{name}.ckpt" for name in ("last", "best"))
     content = last.read_bytes()
     last.write_bytes(content[:-1000])
     assert find_resumable(last.parent) == last
     assert last.read_bytes() == best.read_bytes() != content
-    last.write_bytes(flipped(content))
+    last.write_bytes(content)
+    flip(last, len(content) // 2)
     caplog.clear()
     train(*SCORED, resume=True)
     assert "last.ckpt cannot be read" in caplog.text

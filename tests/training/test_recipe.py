@@ -1,10 +1,7 @@
 """recipe=paper: its settings, and that what it computes is what its sources print."""
 
 import itertools
-import json
-import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -243,52 +240,24 @@ def test_a_run_logs_every_term_in_its_loss(model, scenes, tmp_path):
     assert float(rows[0]["train/l_r"]) > 1e-3 * parts.sparse.square().sum().item()
 
 
-def check_runs(folder: Path, *overrides: str) -> None:
-    """A few steps of the recipe, of the field that renders the fixed view too."""
-    named = (text for text in TINY if text != "lrm=none" and not text.startswith("data."))
-    config = changed(("recipe=paper", *named), "lrm=tiny", *overrides)
-    config["preparation"] |= {"cache": str(folder / "cache"), "frames": 3, "fixed_view_steps": 2}
-    config["trainer"]["max_steps"] = 2
-    run(config, folder / "run", [], resume=False)
-    told = metrics(folder / "run")
-    assert told["lrm"]["fixed_view"] == "3 frames rendered by kplanes trained for 2 steps"
-    assert told["step"] == 2
-    assert 0 < told["test"]["psnr"] < 60
-
-
 @pytest.mark.slow
-def test_it_runs_on_a_scene_off_centre(scenes, tmp_path, reduced):
-    sizes = (text for text in TINY if text.startswith("data."))
-    check_runs(tmp_path, *sizes, f"data.root={scenes}", "data=suite", "data.scene=off_centre")
-
-
-@pytest.mark.slow
-def test_it_runs_on_a_scene_of_d_nerf_three_times_as_large(scenes, tmp_path, reduced):
-    ordinary = Experiment.read(small(f"data.root={scenes}")).data
-    enlarge(ordinary.folder, tmp_path / "large", 3.0)
-    given = "data=dnerf", f"data.root={tmp_path}", "data.scene=large", "data.resolution=null"
-    check_runs(tmp_path, *given)
-
-
-@pytest.fixture
-def reduced(monkeypatch) -> None:
-    """Small K-Planes render the fixed view."""
+def test_it_runs_on_a_scene_off_centre(scenes, tmp_path, monkeypatch):
+    """A few steps, of the small K-Planes that render the fixed view too."""
 
     def composed(name, lines):
         return compose_plain(name, [*lines, *KPLANES, *PROPOSAL])
 
     monkeypatch.setattr(fixed_view, "compose_plain", composed)
-
-
-def enlarge(folder: Path, target: Path, factor: float) -> None:
-    """Copy a scene of D-NeRF's format with all distances times a factor."""
-    shutil.copytree(folder, target)
-    for path in target.glob("transforms_*.json"):
-        content = json.loads(path.read_text())
-        for frame in content["frames"]:
-            for row in frame["transform_matrix"][:3]:
-                row[3] *= factor
-        path.write_text(json.dumps(content))
+    sizes = (text for text in TINY if text != "lrm=none")
+    scene = f"data.root={scenes}", "data=suite", "data.scene=off_centre"
+    config = changed(("recipe=paper", *sizes), "lrm=tiny", *scene)
+    config["preparation"] |= {"cache": None, "frames": 3, "fixed_view_steps": 2}
+    config["trainer"]["max_steps"] = 2
+    run(config, tmp_path / "run", [], resume=False)
+    told = metrics(tmp_path / "run")
+    assert told["lrm"]["fixed_view"] == "3 frames rendered by kplanes trained for 2 steps"
+    assert told["step"] == 2
+    assert 0 < told["test"]["psnr"] < 60
 
 
 def test_half_the_timesteps_are_rows_whatever_the_lrm_has():

@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.training.runs import small_config
-from xplanes.files import read_rows
+from tests.training.runs import scores, small_config
 from xplanes.metrics import mean
 from xplanes.run import run
 from xplanes.tools.runs import load_run
@@ -26,7 +25,7 @@ def test_a_saving_costs_less_than_its_bound(scenes, tmp_path):
         "callbacks.evaluation.at=[0]",
     )
     run(config, tmp_path / "run", [], resume=False)
-    first, last = (float(row["psnr"]) for row in read_rows(tmp_path / "run" / "curve.csv"))
+    first, last = scores(tmp_path / "run")
     assert last > first + 8
     trained = load_run(tmp_path / "run", device="cpu")
     field, views, white = trained.module.field, trained.views, torch.ones(3)
@@ -38,11 +37,11 @@ def test_a_saving_costs_less_than_its_bound(scenes, tmp_path):
         renderer = replace(trained.module.renderer, **changes)
         with torch.no_grad():
             samples = len(renderer.render(field, *rays, times, white).samples)
-        scores = [
+        found = [
             score_view(field, renderer, trained.frame, views, index, white)[0].psnr
             for index in range(len(views))
         ]
-        return samples, mean(scores)
+        return samples, mean(found)
 
     kept, psnr = look()
     every, _ = look(skip_empty=False, occlusion=0.0)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.refusals import interrupt
 from xplanes.synthetic.demo import ensure_demo_scene, write
 from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE
 
@@ -129,10 +130,7 @@ def test_writers_at_the_same_time_leave_one_whole_folder(folder, tmp_path):
 
 
 def test_a_failed_rendering_leaves_nothing(tmp_path, monkeypatch):
-    def fail(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("xplanes.synthetic.demo.write.render_image", fail)
+    monkeypatch.setattr(write, "render_image", interrupt)
     with pytest.raises(KeyboardInterrupt):
         make(tmp_path)
     assert list(tmp_path.iterdir()) == []

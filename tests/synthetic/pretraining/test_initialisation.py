@@ -82,12 +82,7 @@ def test_exported_weights_are_loaded_unchanged(tmp_path):
     # Queries and keys are equally wide.
     assert "transformer.layers.0.cross_attn.in_proj_weight" in state
     assert not [name for name in state if "q_proj" in name]
-    images = torch.rand(2, 3, 24, 24)
-    planes = loaded.encode(images)
-    assert planes.shape == (2, 3, 8, 8, 8)
-    rgb, density = loaded.decoder(torch.rand(5, 24))
-    assert rgb.shape == (5, 3)
-    assert density.shape == (5,)
+    assert loaded.encode(torch.rand(2, 3, 24, 24)).shape == (2, 3, 8, 8, 8)
     assert load(SIZES, path).config == loaded.config
 
 

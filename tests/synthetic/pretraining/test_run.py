@@ -25,10 +25,12 @@ from xplanes.synthetic.pretraining.pool import PretrainingBatches
 from xplanes.synthetic.pretraining.run import CHECKPOINT
 
 
-@pytest.fixture(autouse=True)
-def short_shards(monkeypatch):
-    monkeypatch.setattr(pool_module, "SHARD", 8)
-    monkeypatch.setattr("xplanes.synthetic.pretraining.run.SHARD", 8)
+@pytest.fixture(scope="module", autouse=True)
+def short_shards():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pool_module, "SHARD", 8)
+        patch.setattr("xplanes.synthetic.pretraining.run.SHARD", 8)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -71,13 +73,10 @@ def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, pool_folder, m
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory, pool_folder):
+def finished(tmp_path_factory, pool_folder, short_shards):
     """The folder of a pretraining of one step."""
     folder = tmp_path_factory.mktemp("finished")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pool_module, "SHARD", 8)
-        patch.setattr("xplanes.synthetic.pretraining.run.SHARD", 8)
-        assert command(folder, pool_folder, "schedule.max_steps=1") == 0
+    assert command(folder, pool_folder, "schedule.max_steps=1") == 0
     return folder
 
 

@@ -1,6 +1,7 @@
 """Rigs with calibrations of EasyMocap, of Google's immersive videos, and of CMU Panoptic."""
 
 import json
+import re
 from functools import partial
 from pathlib import Path
 
@@ -161,6 +162,43 @@ def test_damaged_calibrations_are_refused_by_name(tmp_path, kind, old, new, word
     for path in [*tmp_path.glob("*.yml"), *tmp_path.glob("*.json")]:
         path.write_text(path.read_text().replace(old, new))
     refused(partial(read, tmp_path), words)
+
+
+@pytest.mark.parametrize(
+    ("keys", "down"), [({"pixel_aspect_ratio": 1.25}, 1.25), ({"skew": 0.5}, None)], ids=str
+)
+def test_pixels_of_immersive_videos(tmp_path, keys, down):
+    build(tmp_path, "immersive")
+    path = tmp_path / "models.json"
+    path.write_text(json.dumps([camera | keys for camera in json.loads(path.read_text())]))
+    if down is None:
+        refused(partial(read, tmp_path), r"skew .* are \[0.5\]")
+        return
+    focal = read(tmp_path).splits["train"].intrinsics.focal[0].tolist()
+    assert focal == pytest.approx([OPENCV[0], down * OPENCV[0]])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cameras_whose_pose_is_not_finite_are_left_out(tmp_path, kind):
+    names = build(tmp_path, kind)
+    first = r'("position": \[|"t": \[\[|T_0?0: (?s:.*?)data: \[)[^,\]]+'
+    for path in [*tmp_path.rglob("*.yml"), *tmp_path.glob("*.json")]:
+        path.write_text(re.sub(first, r"\g<1>NaN", path.read_text(), count=1))
+    with told(f"1 of 4 cameras are left out:\n.*: {names[0]}: the pose|no camera of {names[0]}"):
+        assert len(read(tmp_path).splits["train"]) == 9
+
+
+@pytest.mark.parametrize("name", ["Camera ({})", "cam-{}", "{}_K_1"])
+def test_cameras_of_easymocap_have_any_names(tmp_path, name):
+    names = [name.format(camera) for camera in range(4)]
+    write(tmp_path, "EasyMocap's vectors", names)
+    path = tmp_path / "intri.yml"  # As OpenCV writes numbers.
+    path.write_text(path.read_text().replace(f": {HEIGHT}\n", f": {HEIGHT:e}\n"))
+    for camera in names:
+        save(tmp_path / "images" / camera / "0.png", picture(0)[::2, ::2])
+    assert MultiCameraSettings.recognises(tmp_path)
+    views = read(tmp_path).splits["train"]
+    assert views.intrinsics.centre[0].tolist() == pytest.approx([c / 2 for c in OPENCV[2:4]])
 
 
 @pytest.mark.parametrize("content", ["[]", '{"cameras": []}'])

@@ -385,6 +385,10 @@ def test_times_from_a_table(capture):
     # A spreadsheet of a country whose decimals have commas.
     table.write_text("File; Time\n" + "\n".join(line.replace(",", "; ") for line in lines))
     assert torch.equal(capture.views(times="times.csv").times, found)
+    # Decimals with commas, other folders, and no endings.
+    rows = [f"out/{name.removesuffix('.png')};{i * i / 10}" for i, name in enumerate(capture.names)]
+    table.write_text("file;time\n" + "\n".join(rows).replace(".", ","))
+    assert torch.equal(capture.views(times="times.csv").times, found)
     columns = r"times\.csv: line 2 is .*The first line must name the columns file and time"
     for text, words in (
         (

@@ -1,10 +1,11 @@
 """Captures as LLFF's tools write them."""
 
+import numpy as np
 import pytest
 import torch
 
 from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings, write_colmap, write_rows
-from tests.scenes.common import refused
+from tests.scenes.common import refused, told
 from xplanes.scenes.colmap import ColmapSettings
 from xplanes.scenes.llff import LlffSettings
 from xplanes.scenes.multicamera import MultiCameraSettings
@@ -87,6 +88,16 @@ def test_models_of_colmap_beside_it_are_preferred(folder):
     assert found.splits["train"].times[1] == pytest.approx(1 / 9)
     (folder / "flow").mkdir()
     assert LlffSettings.recognises(folder)
+
+
+def test_rows_that_are_not_finite_are_left_out(folder):
+    rows = np.load(folder / "poses_bounds.npy")
+    rows[4, 0] = np.nan
+    np.save(folder / "poses_bounds.npy", rows)
+    with told(r"1 of 10 rows are left out:\n.*row 4 \(IMG_4.JPG\)"):
+        files = [file for views in read(folder).splits.values() for file in views.files]
+    assert len(files) == 9
+    assert not any("IMG_4" in file for file in files)
 
 
 def test_other_numbers_of_images_than_of_rows(folder):

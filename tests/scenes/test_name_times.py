@@ -76,6 +76,7 @@ def test_names_tell_times(names, times):
         ([f"frame{i:05d}/{j:02d}.png" for i in range(4) for j in range(2)], "taken for cameras"),
         ([f"{i:03d}/{j:02d}.png" for i in range(4) for j in range(3)], "taken for cameras"),
         (["t_-2.png", "t_1.png", "t_2.png"], "-2"),
+        (["-1.50.png", "-0.50.png", "0.50.png"], r"\(0.50.png -> 0.5, -0.50.png -> -0.5\)"),
         ([f"view_{i:03d}.png" for i in range(120)], r"may be those of cameras .*view_001.png -> 1"),
         ([f"V{i}.png" for i in range(100)], "may be those of cameras"),
         ([f"V{i}.png" for i in range(101)], "may be those of cameras"),

@@ -1,6 +1,7 @@
 """The reader of captures of Nerfies, HyperNeRF and DyCheck."""
 
 import json
+import math
 import shutil
 from functools import partial
 from pathlib import Path
@@ -149,6 +150,15 @@ def test_captures_that_are_not_whole(capture):
     with told(r"(?s)2 of 6 images are left out.*for 000001.*000005\.js"):
         parts = read(capture, resolution=20).splits
     assert [len(views) for views in parts.values()] == [3, 1]
+    capture.change("camera/000003.json", position=[0, math.nan, 0])
+    with told(r"3 of 6 images are left out|000004|position is \[0, nan, 0\]"):
+        assert len(read(capture, "train").splits["train"]) == 3
+    for scale in (capture.path / "rgb").iterdir():
+        scale.rename(capture.path / scale.name)
+    (capture.path / "rgb").rmdir()
+    (capture.path / "1x").rename(capture.path / "rgb")
+    with told("images are left out|000004"):
+        assert read(capture, "train").splits["train"].width == WIDTH
     shutil.rmtree(capture.path / "rgb")
     shutil.copy(capture.path / "camera/000004.json", capture.path / "camera/000005.json")
     refused(capture, r"rgb has no folder, such as 1x or 4x, with an image of 000000")

@@ -736,6 +736,25 @@ def test_images_elsewhere_or_one_folder_deeper(capture):
     assert capture.train().files == tuple(f"images/{file}" for file in expected)
 
 
+@pytest.mark.parametrize("place", ["../data/fox/images", "train", "C:\\data\\train"])
+def test_images_of_other_places_are_found_in_the_folder(capture, place):
+    capture.change_each(file_path=lambda name: f"{place}/{Path(name).name}")
+    assert len(capture.all()) == 10
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [{"cx": 0.5, "cy": 0.5}, {"cx": 0, "cy": 0}, {"cx": 24.0, "cy": 24.0, "w": ..., "h": ...}],
+    ids=keys_of,
+)
+def test_principal_points_in_other_units_are_told_of(capture, keys):
+    capture.change(**keys)
+    with told("frame_00000.png: the principal point .* far from the middle .* 24x24 pixels"):
+        capture.train()
+    capture.change(fl_x=FOCAL / SIZE**2, fl_y=FOCAL / SIZE**2)
+    capture.refused("the focal length along x is .* must lie between 0.02")
+
+
 @pytest.mark.parametrize("name", ["", None])
 def test_frames_without_a_name_are_left_out(capture, name):
     capture.change(3, file_path=name)

@@ -5,13 +5,14 @@ All three give rotations and translations from the world to cameras with OpenCV'
 
 import re
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from xplanes.errors import SceneError
-from xplanes.scenes.entries import checked_pose, decoded, parsed, reading, short, some
+from xplanes.scenes.entries import checked_pose, decoded, parsed, reading, short, some, usable
 from xplanes.scenes.listing import Calibration
 from xplanes.scenes.transforms import read_calibration
 
@@ -19,13 +20,13 @@ FILES = ("extri.yml", "models.json", "calibration_*.json", "*/extri.yml", "*/cal
 """Files of EasyMocap (with intri.yml beside it), of immersive videos and of CMU Panoptic."""
 
 MATRIX = re.compile(
-    r"^([A-Za-z]+)_([^:\n]+?)\s*:\s*!!opencv-matrix\s+rows:\s*(\d+)\s+cols:\s*(\d+)\s+dt:\s*\w+\s+"
-    r"data:\s*\[([^\]]*)\]|^([HW])_([^:\n]+?)\s*:\s*([\d.]+)\s*$",
+    r"^([A-Za-z]+)_([^:\n]+):\s*!!opencv-matrix\s+rows:\s*(\d+)\s+cols:\s*(\d+)\s+dt:\s*\w+\s+"
+    r"data:\s*\[([^\]]*)\]|^([HW])_([^:\n]+):[ \t]*([\d.]+(?:[Ee][+-]?\d+)?)\s*$",
     re.M,
 )
 """A matrix, or a height or width, in a YAML file of OpenCV."""
 
-OWNER = re.compile(r"^(?:K|Rot|R|T)_([^:\n]+?)\s*:", re.M)
+OWNER = re.compile(r"^(?:K|Rot|R|T)_([^:\n]+):", re.M)
 """The name of a camera, at the beginning of one of its matrices."""
 
 Camera = tuple[str, Any, Any, dict[str, Any]]
@@ -57,7 +58,7 @@ def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibratio
         SceneError: If the file is not such a calibration, or if it is one of several.
     """
     advice = "Export it again, or write a transforms.json with a frame of each camera."
-    cameras, rivals = [], sorted(each.name for each in path.parent.glob("calibration_*.json"))
+    rivals = sorted(each.name for each in path.parent.glob("calibration_*.json"))
     if path.name in rivals[:1] and len(rivals) > 1:
         raise SceneError(
             f"{path.parent} holds {len(rivals)} calibrations: {some(rivals)}. Keep only one there."
@@ -65,21 +66,26 @@ def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibratio
     with reading(path, "as the calibration of cameras", advice):
         try:
             read = _easymocap if path.suffix == ".yml" else _in_json
-            for name, rotation, shift, keys in read(path, decoded(path.read_bytes())):
-                if not isinstance(name, str):
-                    raise TypeError(f"name is {short(name)}")
-                label, turn = f"{path}: {name}", np.array(rotation, dtype=np.float64)
-                turn = turn if turn.size == 9 else _rotation(turn.ravel())
-                pose = np.eye(4)
-                pose[:3, :3] = turn.T * [1, -1, -1]
-                pose[:3, 3] = -turn.T @ np.array(shift, dtype=np.float64).ravel()
-                calibration = read_calibration(label, {}, label, keys)
-                cameras.append((name, label, checked_pose(label, pose, "the pose"), calibration))
+            cameras = [*read(path, decoded(path.read_bytes()))]
+            if not cameras:
+                raise ValueError("it holds no camera")
+            return usable("cameras", partial(_placed, path), cameras)
         except (LookupError, TypeError) as problem:
             raise ValueError(f"an entry is missing or of another kind: {problem}") from problem
-        if not cameras:
-            raise ValueError("it holds no camera")
-    return cameras
+
+
+def _placed(path: Path, camera: Camera) -> tuple[str, str, np.ndarray, Calibration]:
+    """Name, label, pose and calibration of a camera."""
+    name, rotation, shift, keys = camera
+    if not isinstance(name, str):
+        raise TypeError(f"name is {short(name)}")
+    label, turn = f"{path}: {name}", np.array(rotation, dtype=np.float64)
+    turn = turn if turn.size == 9 else _rotation(turn.ravel())
+    pose = np.eye(4)
+    pose[:3, :3] = turn.T * [1, -1, -1]
+    pose[:3, 3] = -turn.T @ np.array(shift, dtype=np.float64).ravel()
+    pose = checked_pose(label, pose, "the pose")
+    return name, label, pose, read_calibration(label, {}, label, keys)
 
 
 def _rotation(vector: np.ndarray) -> np.ndarray:
@@ -116,11 +122,11 @@ def _easymocap(path: Path, content: str) -> Iterable[Camera]:
     text = f"{content}\n{decoded(path.with_name('intri.yml').read_bytes())}"
     for kind, name, rows, columns, data, side, owner, length in MATRIX.findall(text):
         if side:
-            found[side, owner] = float(length)
+            found[side, owner.strip()] = float(length)
         else:
             values = [float(number) for number in re.split(r"[,\s]+", data.strip(", \r\n"))]
-            found[kind, name] = np.reshape(values, (int(rows), int(columns)))
-    for name in dict.fromkeys(OWNER.findall(text)):
+            found[kind, name.strip()] = np.reshape(values, (int(rows), int(columns)))
+    for name in dict.fromkeys(map(str.strip, OWNER.findall(text))):
         rotation = found["Rot", name] if ("Rot", name) in found else found["R", name]
         distortion = found.get(("dist", name), found.get(("D", name), []))
         size = {key.lower(): found[key, name] for key in "WH" if (key, name) in found}
@@ -145,9 +151,10 @@ def _in_json(path: Path, content: str) -> Iterable[Camera]:
                 "read. Undistort the videos, and write a transforms.json with a frame of each."
             )
         (cx, cy), focal = camera["principal_point"], camera["focal_length"]
-        keys = {"camera_model": "OPENCV_FISHEYE", "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy}
+        down, label = focal * camera.get("pixel_aspect_ratio", 1), f"{path}: {camera['name']}"
+        keys = {"camera_model": "OPENCV_FISHEYE", "fl_x": focal, "fl_y": down, "cx": cx, "cy": cy}
         keys |= {"w": camera["width"], "h": camera["height"]}
-        label = f"{path}: {camera['name']}"
-        keys |= _coefficients(label, ("k1", "k2"), camera["radial_distortion"])
+        skew = camera.get("skew", 0)
+        keys |= _coefficients(label, ("k1", "k2"), camera["radial_distortion"], skew)
         rotation = _rotation(np.array(camera["orientation"], dtype=np.float64))
         yield camera["name"], rotation, -rotation @ np.array(camera["position"]), keys

@@ -28,6 +28,7 @@ from xplanes.scenes.entries import (
     number_in,
     short,
     some,
+    spelt,
     unit_times,
     usable,
 )
@@ -360,7 +361,8 @@ def _listed_times(path: Path, names: Sequence[str]) -> list[float]:
         ) from problem
     known: dict[str, float] = {}
     for line, row in enumerate(rows, start=2):
-        file, number = row.get("file"), number_in(row.get("time") or "")
+        file, time = row.get("file"), row.get("time") or ""
+        number = number_in(time if mark == "," else time.replace(",", "."))
         if file is None or number is None:
             raise SceneError(
                 f"{path}: line {line} is {short(row)}. The first line must name the columns file "
@@ -371,6 +373,10 @@ def _listed_times(path: Path, names: Sequence[str]) -> list[float]:
                 f"{path}: line {line} gives {file} the time {number}, an earlier one "
                 f"{known[file]}. Remove one of them."
             )
+    stems = {PurePosixPath(spelt(file)).stem: time for file, time in known.items()}
+    own = [PurePosixPath(name).stem for name in names]
+    if len(stems) == len(known) and len({*own}) == len(own):  # Of other folders, or no ending.
+        known |= {name: stems[stem] for name, stem in zip(names, own, strict=True) if stem in stems}
     if bare := [name for name in names if name not in known]:
         raise SceneError(
             f"{path} has no time for {len(bare)} of {len(names)} images: {some(bare)}. Add a line "

@@ -198,21 +198,27 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
     if whole.is_relative_to(folder):
         parts = whole.relative_to(folder).parts
     elif not PureWindowsPath(name).anchor:
-        # The file of the cameras may have been moved up, out of a folder beside the images.
-        inner = PurePosixPath(spelt(name).replace("../", ""))
-        places = (whole, folder / inner)
-        there = [any(Path(f"{place}{end}").exists() for end in SUFFIXES) for place in places]
-        if there != [False, True]:
+        # The file of the cameras may have been moved, out of a folder beside the images.
+        outer = PurePosixPath(spelt(name).replace("../", "")).parts
+        tails = [PurePosixPath(*outer[first:]) for first in range(max(1, len(outer) - 1))]
+
+        def is_there(place: Path) -> bool:
+            return any(Path(f"{place}{end}").exists() for end in SUFFIXES)
+
+        inner = next((tail for tail in tails if is_there(folder / tail)), None)
+        if inner is None or is_there(whole):
             raise SceneError(
                 f"{label}: {key} leaves the scene's folder {folder} (it is {name}). Put its files "
                 f"inside the folder and correct {key}."
             )
         name, parts = inner.as_posix(), inner.parts
     # If the path does not exist, its first folders are dropped one by one. That of a split tells
-    # apart files such as train/0001.png and test/0001.png, and so does a folder that exists.
+    # apart files such as train/0001.png and test/0001.png, and so does a folder that exists. Images
+    # for training may lie without such a folder.
     last, own = len(parts), parts[:-1]
     if own and not PureWindowsPath(name).anchor:
-        splits = [place for place, part in enumerate(own) if part.lower() in SPLIT_FOLDERS]
+        kept = SPLIT_FOLDERS[not (folder / SPLIT_FOLDERS[0]).is_dir() :]
+        splits = [place for place, part in enumerate(own) if part.lower() in kept]
         last = 1 if folder.joinpath(*own).is_dir() else min([*(p + 1 for p in splits), last])
     for first in range(max(1, last)):
         relative = Path(*parts[first:])
@@ -242,6 +248,16 @@ def mask_files(folder: Path, names: Sequence[Sequence[str]]) -> tuple[Path | Non
             "the masks there, or set data.masks=null."
         )
     return masks
+
+
+def read_array(path: Path, advice: str) -> np.ndarray:
+    """An array from a file of NumPy, mapped to memory.
+
+    Raises:
+        SceneError: If it cannot be read; ``advice`` is added to the message.
+    """
+    with reading(path, "as an array", advice):
+        return np.lib.format.open_memmap(path, mode="r")
 
 
 def unit_times(times: Sequence[float], span: tuple[float, float] | None = None) -> list[float]:

@@ -18,8 +18,11 @@ from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.masks import MaskKind, ignored_pixels
 from xplanes.scenes.views import Intrinsics, Views, spread
 
-SHORTEST, LONGEST = 1e-3, 1e5
+SHORTEST, LONGEST = 0.02, 1e5
 """Smallest and largest focal length, relative to the image size."""
+
+ASIDE = 0.25
+"""Larger offsets of a principal point from the middle, relative to the image size, are doubtful."""
 
 FARTHEST_ASIDE, STRONGEST = 1e3, 1e6
 """Largest offset of a principal point, relative to the image size, and largest coefficient."""
@@ -377,7 +380,8 @@ def final_intrinsics(
 ) -> Intrinsics:
     """Intrinsics of images in their final sizes.
 
-    Warns about perspective lenses that map no direction to some of the pixels.
+    Warns about perspective lenses that map no direction to some of the pixels, and about principal
+    points far from the middle.
 
     Args:
         labels: The images, for messages. [V]
@@ -395,6 +399,7 @@ def final_intrinsics(
     ]
     for label, size, camera, numbers in zip(labels, sizes, calibrations, known, strict=True):
         _require_real(label, size, camera, *numbers)
+    _warn_of_other_units(labels, sizes, [middle for _, middle, _ in known])
     focal, centre, skew = (
         torch.tensor(values, dtype=torch.float64) for values in zip(*known, strict=True)
     )
@@ -435,6 +440,24 @@ def _require_real(
         raise SceneError(
             f"{label}: its {camera.description}; no coefficient may exceed {STRONGEST:g}. Correct "
             "the camera, or calibrate again."
+        )
+
+
+def _warn_of_other_units(
+    labels: Sequence[str], sizes: Sequence[Size], middles: Sequence[tuple[float, float]]
+) -> None:
+    """Warn about principal points that are probably those of images of another size."""
+    far = [
+        f"{label}: the principal point ({x:.4g}, {y:.4g}) lies far from the middle of the image, "
+        f"which has {width}x{height} pixels here"
+        for label, (height, width), (x, y) in zip(labels, sizes, middles, strict=True)
+        if max(abs(x / width - 0.5), abs(y / height - 0.5)) > ASIDE
+    ]
+    if far:
+        warn(
+            f"{far[0]}; so do those of {len(far)} of {len(labels)} cameras or images. Unless these "
+            "were cropped, the calibration is for images of another size, which must be given "
+            "(w and h in transforms files), or is not in pixels: correct it."
         )
 
 

@@ -44,8 +44,8 @@ class LlffSettings(CaptureSettings):
         images = min(
             found, key=lambda each: width_rank(native_sizes(each[:1])[0][1], self.resolution)
         )
+        images, labels, poses, calibrations = zip(*read_poses_bounds(path, images), strict=True)
         names = [image.name for image in images]
-        labels, poses, calibrations = zip(*read_poses_bounds(path, names), strict=True)
         dynamic = self.static is False or is_dynamic(self.folder)
         times = times_in_names(names, True, OTHER_TIMES) if dynamic else []
         listing = Listing.checked(

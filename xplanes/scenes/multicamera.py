@@ -14,10 +14,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xplanes.errors import ConfigError, MissingSplitError, SceneError, refuse_all, warn
+from xplanes.errors import (
+    BrokenFrameError,
+    ConfigError,
+    MissingSplitError,
+    SceneError,
+    refuse_all,
+    warn,
+)
 from xplanes.files import natural
 from xplanes.scenes import store, videos
-from xplanes.scenes.entries import origin_near, some, unit_times, world_turn
+from xplanes.scenes.entries import origin_near, some, unit_times, usable, world_turn
 from xplanes.scenes.formats import ENDINGS, read_header
 from xplanes.scenes.images import (
     Picture,
@@ -29,7 +36,14 @@ from xplanes.scenes.images import (
     shrink,
 )
 from xplanes.scenes.listing import final_intrinsics, misshapen
-from xplanes.scenes.name_times import DATE, Number, most_different, times_of_clocks
+from xplanes.scenes.name_times import (
+    CAMERA,
+    DATE,
+    Number,
+    most_different,
+    times_of_clocks,
+    timesteps_of,
+)
 from xplanes.scenes.rigs import (
     POSES,
     Camera,
@@ -107,6 +121,8 @@ class MultiCameraSettings(SceneSettings):
         if not folder.is_dir():
             raise self.no_scene()
         cameras, content = read_cameras(folder)
+        found = usable("cameras", _recording, cameras)
+        cameras = [each.camera for each in found]
         parts = _split_cameras(folder, cameras, self.test_cameras)
         for split in splits:
             if split not in parts:
@@ -115,9 +131,9 @@ class MultiCameraSettings(SceneSettings):
                     "cameras to score with data.test_cameras=[NAME], or leave data.eval_split out."
                 )
         watched = _video_camera(cameras, parts, self.video_camera)
-        found = [_recording(camera) for camera in cameras]
         seen = [path for each in found for path in each.images or [each.camera.source]]
         warn_of_masks(folder, seen, "put them into the alpha channel of the cameras' images")
+        _warn_of_timesteps(folder, found)
         recordings = _simultaneous(found)
         poses = torch.from_numpy(np.stack([camera.pose for camera in cameras]))
         poses[:, :3, 3] -= torch.from_numpy(origin_near(folder, poses[:, :3, 3].numpy()))
@@ -229,7 +245,7 @@ def _recording(camera: Camera) -> Recording:
         return Recording(camera, *videos.read_header(camera.source))
     images = frames_in(camera.source)
     if not images:
-        raise SceneError(
+        raise BrokenFrameError(
             f"{camera.source} holds no images ({', '.join(ENDINGS)}), nor does a folder in it, "
             "nor is there a single video. Add the frames of the camera, or take it out of the "
             f"calibration ({camera.label})."
@@ -237,6 +253,21 @@ def _recording(camera: Camera) -> Recording:
     first = f"{images[0]} of the same camera"
     size = shared_size(images, first, "Export its frames alike.")
     return Recording(camera, size, len(images), None, images=tuple(images))
+
+
+def _warn_of_timesteps(folder: Path, recordings: Sequence[Recording]) -> None:
+    """Warn if folders may be timesteps rather than cameras."""
+    places = [(each.camera.source.name, path.name) for each in recordings for path in each.images]
+    cameras = {match[0] for _, name in places if (match := CAMERA.search(name))}
+    digits = [[len(re.sub(r"\D", "", part)) for part in place] for place in places]
+    found = timesteps_of([*map("/".join, places)])
+    several = len(places) > len(recordings)
+    if found and several and (len(cameras) > 1 or all(outer > inner for outer, inner in digits)):
+        warn(
+            f"{folder}: the folders {some(found)} are taken for cameras, but may be timesteps with "
+            f"an image of each camera, such as {'/'.join(places[0])}. If so, give each camera a "
+            "folder of its images."
+        )
 
 
 def _are_stamped(recordings: Sequence[Recording]) -> bool:

@@ -40,7 +40,12 @@ FRAME = re.compile(r"(?i)\d{4}|^[cv]\d{3}")
 MOST_CAMERAS = 64
 """Number of images up to which numbers of cameras are taken for these, as in cam00 to cam19."""
 
-CLOCK = re.compile(r"(?<![A-Za-z\d])\d+\.\d+(?=s?$)|(?<!\d)(\d{10})[_-](\d{9}|\d{6}|\d{3})$")
+SIGN = r"(?:(?:(?<=[_ ])|^)-)?"
+"""The sign of a number at the beginning of a name, or after a separator."""
+
+CLOCK = re.compile(
+    rf"{SIGN}(?<![A-Za-z\d])\d+\.\d+(?=s?$)|(?<!\d)(\d{{10}})[_-](\d{{9}}|\d{{6}}|\d{{3}})$"
+)
 """Seconds and their fraction at the end of a name, as in 1305031102.175304."""
 
 DATE = re.compile(
@@ -58,8 +63,8 @@ LEAST_STEP = 10
 COPY = re.compile(r"\s*\((\d+)\)$")
 """The number that browsers and file managers add to names of copies, as in clip_1(3)."""
 
-NUMBER = r"(?:(?:(?<=[_ ])|^)-)?\d+"
-"""A whole number; a sign belongs to it at the beginning, or after a separator."""
+NUMBER = rf"{SIGN}\d+"
+"""A whole number."""
 
 Number = int | float
 
@@ -233,6 +238,16 @@ def _checked(
             break
     if not why and _few(names, times):
         why = f"are only {len(set(times))}, for {len(names)} images"
+    if not why and by_file and (folders := timesteps_of(names)):
+        why = f"are those of the files, and the folders {some(folders)} are taken for cameras"
+    if why:
+        pairs = ", ".join(f"{names[place]} -> {times[place]}" for place in shown)
+        warn(f"The times from the numbers in the names {why} ({pairs}). {advice}")
+    return times
+
+
+def timesteps_of(names: Sequence[str]) -> list[str]:
+    """The folders of images, if they may be timesteps with an image of each camera; else none."""
     folders = Counter(PurePosixPath(name).parent.name for name in names)
     # Numbers with large gaps are those of devices.
     counts = [int(folder) for folder in folders if re.fullmatch(r"\d{4,6}", folder)]
@@ -241,10 +256,4 @@ def _checked(
         # Files of few digits are cameras rather than frames.
         short = all(len(re.sub(r"\D", "", PurePosixPath(name).stem)) < 3 for name in names)
         timesteps |= short and len(folders) > max(folders.values())
-    if not why and by_file and timesteps and not any(map(CAMERA.search, folders)):
-        found = some(sorted(folders))
-        why = f"are those of the files, and the folders {found} are taken for cameras"
-    if why:
-        pairs = ", ".join(f"{names[place]} -> {times[place]}" for place in shown)
-        warn(f"The times from the numbers in the names {why} ({pairs}). {advice}")
-    return times
+    return sorted(folders) if timesteps and not any(map(CAMERA.search, folders)) else []

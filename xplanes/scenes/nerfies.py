@@ -15,8 +15,8 @@ from xplanes.scenes.entries import (
     image_path,
     is_number,
     mask_files,
+    read_array,
     read_object,
-    reading,
     short,
     some,
     unit_times,
@@ -207,7 +207,9 @@ def _numbers(path: Path, content: Mapping[str, Any], key: str, count: int) -> np
     """A list of finite numbers. float64 [count]"""
     values = content.get(key)
     if not (isinstance(values, list) and len(values) == count and all(map(is_number, values))):
-        raise SceneError(
+        # NaN and infinity are those of one camera, not of another format.
+        broken = isinstance(values, list) and {"nan", "inf", "-inf"} & {*map(str, values)}
+        raise (BrokenFrameError if broken else SceneError)(
             f"{path}: {key} is {short(values)}; it must be {count} numbers. {DOWNLOAD}"
         )
     return np.array(values, dtype=np.float64)
@@ -272,13 +274,12 @@ def _picture_folder(
     """
     widths: dict[str, int] = {}
     lost: dict[str, list[str]] = {}
-    for path in (folder / "rgb").glob("*x"):
-        if not path.name[:-1].isdecimal():
-            continue
-        files = {name: _image_of(path, name) for name in names}
+    scales = [path.name for path in (folder / "rgb").glob("*x") if path.name[:-1].isdecimal()]
+    for scale in scales or ["."]:
+        files = {name: _image_of(folder / "rgb" / scale, name) for name in names}
         if found := [file for file in files.values() if file is not None]:
-            widths[path.name] = native_sizes(found[:1])[0][1]
-            lost[path.name] = [name for name, file in files.items() if file is None]
+            widths[scale] = native_sizes(found[:1])[0][1]
+            lost[scale] = [name for name, file in files.items() if file is None]
     if not widths:
         raise SceneError(
             f"{folder / 'rgb'} has no folder, such as 1x or 4x, with an image of {names[0]}. "
@@ -309,11 +310,11 @@ def _points(path: Path) -> np.ndarray | None:
     if not path.is_file():
         return None
     advice = f"{DOWNLOAD} Or remove it: it is not needed."
-    with reading(path, advice=advice):
-        points = np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+    points = read_array(path, advice)
+    numbers = points.dtype.kind in "fiu"
+    if not (numbers and points.ndim == 2 and points.shape[1] == 3 and np.isfinite(points).all()):
         raise SceneError(
             f"{path} holds an array {list(points.shape)}; it must be finite positions [N, 3]. "
             f"{advice}"
         )
-    return points
+    return points.astype(np.float64)

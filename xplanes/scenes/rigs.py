@@ -18,12 +18,20 @@ from typing import Any
 
 import numpy as np
 
-from xplanes.errors import SceneError, warn
+from xplanes.errors import BrokenFrameError, SceneError, warn
 from xplanes.files import natural
 from xplanes.scenes import videos
 from xplanes.scenes.calibrations import FILES, find_calibration, read_calibrations
 from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, image_count, read_model
-from xplanes.scenes.entries import checked_pose, is_positive, paths_inside, reading, some, usable
+from xplanes.scenes.entries import (
+    checked_pose,
+    is_positive,
+    paths_inside,
+    read_array,
+    some,
+    spelt,
+    usable,
+)
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.listing import Calibration
 from xplanes.scenes.masks import MASKS
@@ -171,7 +179,8 @@ def is_calibrated(folder: Path) -> bool:
             content = path.read_bytes()
             text = content.decode(json.detect_encoding(content), "replace")
             names = _recordings_of_any_name(folder, path)
-            return sum(bool(re.search(rf'["_]{re.escape(name)}\b', text)) for name in names) > 1
+            known = [name for name in names if re.search(rf'["_]{re.escape(name)}(?!\w)', text)]
+            return len(names if path.suffix == ".yml" else known) > 1
     return False
 
 
@@ -223,17 +232,15 @@ def is_rig(folder: Path) -> bool:
     """
     sources: set[Path] = set()
     try:
-        for frame in read_frames(folder / TRANSFORMS)["frames"]:
-            if frame["file_path"] in ("", None):
-                continue
-            source = with_frames(_source("", folder.resolve(), frame["file_path"]))
-            if source in sources:
-                return False
-            if source.is_dir():
-                kinds = [_kind(path) for path in images_in(source)]
-                if len({*kinds}) == len(kinds):
+        frames, named = read_frames(folder / TRANSFORMS)["frames"], _videos_by_name(folder)
+        for frame in frames:
+            with suppress(BrokenFrameError):
+                source = with_frames(_source("", folder.resolve(), frame["file_path"], named))
+                kinds = [] if source.is_file() else [_kind(path) for path in images_in(source)]
+                if source in sources or (kinds and len({*kinds}) == len(kinds)):
                     return False
-            sources.add(source)
+                if kinds or source.is_file():
+                    sources.add(source)
     except SceneError:
         return False
     return len(sources) > 1
@@ -265,40 +272,39 @@ def _from_poses_bounds(folder: Path) -> list[Camera]:
             f"{path}: rows are in the plain order of names, as LLFF writes them: {pairs}. If they "
             "have the order of the numbers, write these with leading zeros."
         )
-    rows = read_poses_bounds(path, names)
     return [
         Camera(camera_name(source), source, pose, calibration, label)
-        for source, (label, pose, calibration) in zip(sources, rows, strict=True)
+        for source, label, pose, calibration in read_poses_bounds(path, sources)
     ]
 
 
 def read_poses_bounds(
-    path: Path, names: Sequence[str]
-) -> list[tuple[str, np.ndarray, Calibration]]:
-    """Label, pose and calibration of each row of poses_bounds.npy.
+    path: Path, sources: Sequence[Path]
+) -> list[tuple[Path, str, np.ndarray, Calibration]]:
+    """Source, label, pose and calibration of each row of poses_bounds.npy.
 
     Args:
         path: The file.
-        names: Images, videos or folders of the rows, in order.
+        sources: Images, videos or folders of the rows, in order.
 
     Raises:
         SceneError: If it cannot be read, or has another number of rows.
     """
-    with reading(path, "as an array", "Export or download it again."):
-        rows = np.load(path, allow_pickle=False)
+    rows = read_array(path, "Export or download it again.")
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
         raise SceneError(
             f"{path} holds {rows.dtype} {list(rows.shape)}, not one row of 17 numbers for each "
             "camera: a pose of 3 rows and 5 columns, then the nearest and the farthest depth."
         )
-    if len(names) != len(rows):
+    if len(sources) != len(rows):
+        names = some([source.name for source in sources]) or "none"
         raise SceneError(
-            f"{path} has {len(rows)} cameras, but {path.parent} holds {len(names)} (cam*, or "
-            f"numbers): {some(names) or 'none'}. Add what is missing, or take the others' rows out."
+            f"{path} has {len(rows)} cameras, but {path.parent} holds {len(sources)} (cam*, or "
+            f"numbers): {names}. Add what is missing, or take the others' rows out."
         )
-    cameras = []
-    for index, (name, row) in enumerate(zip(names, rows, strict=True)):
-        label = f"{path}: row {index} ({name})"
+
+    def read(index: int) -> tuple[Path, str, np.ndarray, Calibration]:
+        row, label = rows[index], f"{path}: row {index} ({sources[index].name})"
         matrix = row[:15].astype(np.float64).reshape(3, 5)
         down, right, back, centre, (height, width, focal) = matrix.T
         for key, value in (("height", height), ("width", width), ("focal length", focal)):
@@ -308,8 +314,9 @@ def read_poses_bounds(
         pose[:3] = np.stack([right, -down, back, centre], axis=1)
         pose = checked_pose(label, pose, "the pose")
         calibration = Calibration(fl_x=float(focal), w=float(width), h=float(height))
-        cameras.append((label, pose, calibration))
-    return cameras
+        return sources[index], label, pose, calibration
+
+    return usable("rows", read, range(len(rows)))
 
 
 def _from_transforms(folder: Path, content: Mapping[str, Any]) -> list[Camera]:
@@ -317,14 +324,17 @@ def _from_transforms(folder: Path, content: Mapping[str, Any]) -> list[Camera]:
     path = folder / TRANSFORMS
     cameras: dict[Path, Camera] = {}
     content_of = functools.cache(with_frames)  # Many frames may be of one camera.
+    named = _videos_by_name(folder)
 
-    def located(item: tuple[int, dict[str, Any]]) -> tuple[str, dict[str, Any], Path]:
+    def located(item: tuple[int, dict[str, Any]]) -> tuple[str, dict[str, Any], Path, np.ndarray]:
         index, frame = item
-        label = f"{path}: frame {index} ({frame['file_path']})"
-        return label, frame, _source(label, folder.resolve(), frame["file_path"])
+        label, name = f"{path}: frame {index} ({frame['file_path']})", frame["file_path"]
+        source = _source(label, folder.resolve(), name, named)
+        if source.is_dir() and is_image(image := Path(spelt(name))):
+            source = named.get(image.stem, source)
+        return label, frame, source, checked_pose(label, frame["transform_matrix"])
 
-    for label, frame, source in usable("frames", located, [*enumerate(content["frames"])]):
-        pose = checked_pose(label, frame["transform_matrix"])
+    for label, frame, source, pose in usable("frames", located, [*enumerate(content["frames"])]):
         if (other := cameras.get(content_of(source))) is not None:
             if np.abs(other.pose - pose).max() > SAME_POSE:
                 raise SceneError(
@@ -366,6 +376,9 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
         if not set(found) & set(expected):  # cam00/images/0001.png
             outer = {parent.name for parent in image.parents}
             found = [path for path in recordings if path.name in outer] or found
+        if not found:  # cam00_0001.png
+            part = r"(?<![A-Za-z\d]){}(?![A-Za-z\d])".format
+            found = [p for p in expected if re.search(part(re.escape(camera_name(p))), image.stem)]
         for path in found:
             owned.setdefault(path, []).append(name)
             label = f"{model.source}: {name}"
@@ -443,15 +456,30 @@ def _counted(model: SparseModel, recordings: Sequence[Path]) -> dict[str, list[P
     return counted
 
 
-def _source(label: str, folder: Path, name: Any) -> Path:
-    """The video or the folder of images that a frame names."""
+def _videos_by_name(folder: Path) -> dict[str, Path]:
+    """Videos in a folder and in those inside, by their names without the ending."""
+    found = [*folder.resolve().glob("*"), *folder.resolve().glob("*/*")]
+    return {path.stem: path for path in found if path.suffix.lower() in videos.SUFFIXES}
+
+
+def _source(label: str, folder: Path, name: Any, named: Mapping[str, Path]) -> Path:
+    """The video or the folder of images that a frame names.
+
+    Args:
+        label: The file and frame, for messages.
+        folder: The scene's folder.
+        name: Name of the video, which may have another ending, of the folder, or of an image in it.
+        named: Result of `_videos_by_name`.
+    """
     for source in paths_inside(label, folder, name, "file_path", "cam00.mp4"):
         if source.is_dir() or (source.is_file() and source.suffix.lower() in videos.SUFFIXES):
             break
         if source.is_file() and source.parent != folder:
             return source.parent
     else:
-        raise SceneError(
+        if (video := named.get(PurePosixPath(spelt(name)).stem)) is not None:
+            return video
+        raise BrokenFrameError(
             f"{label}: {folder / name} is not a video ({', '.join(videos.SUFFIXES)}), a folder "
             "of images or an image in a folder of one camera. Add it, or remove the frame from "
             "the list."

@@ -476,7 +476,9 @@ def read_frames(path: Path) -> dict[str, Any]:
     content = read_object(path, '"frames"')
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise MissingSplitError(f'{path} lists no frames. Its key "frames" must hold at least one.')
+        raise MissingSplitError(
+            f'{path} lists no frames: "frames" is {short(frames)}, not a list of at least one.'
+        )
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise SceneError(f"{path}: frame {index} is {short(frame)}, not an object with keys.")

@@ -170,7 +170,7 @@ def test_folders_of_groups_are_kept_and_found_again(tmp_path, monkeypatch):
                 "data=dnerf data.root=/tmp/a.b data.scene=lego",
                 "data=demo data.train_views=3",
                 "hydra.run.dir=/tmp/x hydra/launcher=joblib +extra=1 ++extra.more=2 ~resume",
-                "model.decoder={width:32} callbacks.evaluation.at=[0,1]",
+                "callbacks.evaluation.at=[0,1]",
                 "data.scene=lego data.scene='1' seed=1_0 data.scene=a,b data.scene=choice(a,b)",
                 "data.masks=null data.root=${oc.env:HOME}",
             )
@@ -179,6 +179,10 @@ def test_folders_of_groups_are_kept_and_found_again(tmp_path, monkeypatch):
 )
 def test_good_command_lines_pass_but_for_the_order_of_options_and_names_of_digits(typed, given):
     assert prepare(typed.split()) == given.split()
+
+
+def test_values_with_spaces_pass_unchanged():
+    assert prepare(["model.decoder={width: 32}"]) == ["model.decoder={width: 32}"]
 
 
 def test_a_group_that_a_run_left_out_can_be_set_again(tmp_path):

@@ -116,6 +116,15 @@ def write_rows(folder, poses, height, width, focal):
     np.save(folder / "poses_bounds.npy", np.array(rows))
 
 
+def write_transforms(folder, names, poses, times, **content):
+    """nerfstudio's file, with keys that all frames share."""
+    frames = [
+        {"file_path": name, "transform_matrix": pose.tolist(), "time": time}
+        for name, pose, time in zip(names, poses, times, strict=True)
+    ]
+    (folder / "transforms.json").write_text(json.dumps({**content, "frames": frames}))
+
+
 class NerfiesFolder:
     """A capture with distorted images whose files can be changed before it is read."""
 

@@ -1,7 +1,8 @@
-"""Commands in this process, as if it were one of their own."""
+"""Commands and benchmarks in this process, as if it were one of their own."""
 
 import atexit
 import contextlib
+import importlib
 import io
 import logging
 import os
@@ -81,3 +82,17 @@ def run(*arguments: str, cwd: Path = ROOT, code: int = 0) -> subprocess.Complete
                 print(end.code, file=err)
     assert ended == code, err.getvalue()
     return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
+
+
+@contextlib.contextmanager
+def benchmark(name: str) -> Iterator[Any]:
+    """A module of ``benchmarks/``; afterwards it and those that it imported are forgotten."""
+    folder, before = str(ROOT / "benchmarks"), {*sys.modules}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        for variable, value in {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "1"}.items():
+            patch.setenv(variable, value)  # So that importing changes none.
+        yield importlib.import_module(name)
+    for module in {*sys.modules} - before:
+        if (getattr(sys.modules[module], "__file__", None) or "").startswith(folder):
+            del sys.modules[module]

@@ -1,6 +1,5 @@
 """Pages of results: they show what the records say, and say when a record is stale."""
 
-import importlib
 import pkgutil
 import re
 import sys
@@ -9,22 +8,13 @@ from typing import Any
 
 import pytest
 
-FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
-MODULES = (
-    *("all", "sections", "runner", "figures", "controls"),
-    *("baselines", "initialisation", "ablations", "paper", "engineering"),
-)
+from tests import inside
 
 
 @pytest.fixture(scope="module")
 def every():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(FOLDER))
-        patch.setenv("OMP_WAIT_POLICY", "PASSIVE")
-        patch.setenv("OMP_NUM_THREADS", "1")
-        yield importlib.import_module("all")
-    for name in MODULES:
-        sys.modules.pop(name, None)
+    with inside.benchmark("all") as module:
+        yield module
 
 
 @pytest.fixture
@@ -176,8 +166,7 @@ def test_printed_commands_name_no_folder(every):
     assert sys.modules["runner"].without_folders(words) == printed
 
 
-def test_stages_that_are_timed_exist(every):
-    stages = importlib.import_module("where_time_goes").STAGES
-    sys.modules.pop("where_time_goes")
-    for _, module, path in stages:
-        assert callable(pkgutil.resolve_name(f"{module}:{path}")), path
+def test_stages_that_are_timed_exist():
+    with inside.benchmark("where_time_goes") as timed:
+        for _, module, path in timed.STAGES:
+            assert callable(pkgutil.resolve_name(f"{module}:{path}")), path

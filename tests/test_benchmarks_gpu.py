@@ -1,7 +1,5 @@
 """The GPU benchmark without a GPU: what it measures, leaves out, survives and writes."""
 
-import csv
-import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +8,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-FOLDER = Path(__file__).resolve().parent.parent / "benchmarks"
+from tests import inside
+from tests.warm import ROOT
+from xplanes.files import read_rows
 
 pytestmark = [
     pytest.mark.slow,
@@ -19,18 +19,19 @@ pytestmark = [
 
 
 @pytest.fixture
-def gpu(monkeypatch):
-    monkeypatch.syspath_prepend(str(FOLDER))
-    monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")  # So that importing changes no variables.
-    module = importlib.import_module("gpu")
-    yield module
-    for name in ("gpu", "runner"):
-        sys.modules.pop(name, None)
+def gpu():
+    with inside.benchmark("gpu") as module:
+        yield module
+
+
+def measure(gpu, folder, *options, code=0):
+    """Run the benchmark, and read its page."""
+    assert gpu.main(["--out", str(folder), *options]) == code
+    return (folder / "gpu.md").read_text(encoding="utf-8")
 
 
 def rows(folder):
-    with (folder / "gpu.csv").open(encoding="utf-8") as file:
-        return {(row["part"], row["name"]): row for row in csv.DictReader(file)}
+    return {(row["part"], row["name"]): row for row in read_rows(folder / "gpu.csv")}
 
 
 @pytest.fixture
@@ -84,8 +85,7 @@ def lego(tmp_path):
 
 
 def test_with_a_gpu_all_parts_run_and_the_page_compares(gpu, faked, found_gpu, lego, tmp_path):
-    assert gpu.main(["--out", str(tmp_path), "--lego", str(lego)]) == 0
-    page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
+    page = measure(gpu, tmp_path, "--lego", str(lego))
     assert faked.begun == [part.name for part in gpu.PARTS]
     assert "A GPU, 80 GiB" in page
     assert "22.00 dB on the GPU, 22.10 dB on the CPU" in page
@@ -102,15 +102,13 @@ def test_with_a_gpu_all_parts_run_and_the_page_compares(gpu, faked, found_gpu, l
 
 def test_devices_that_disagree_are_said_to(gpu, faked, found_gpu, tmp_path):
     faked.psnr["GPU"] = 20.0
-    assert gpu.main(["--out", str(tmp_path), "--only", "training"]) == 0
-    page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
+    page = measure(gpu, tmp_path, "--only", "training")
     assert "difference of -2.10 dB is not within 0.3 dB" in page
 
 
 def test_a_part_that_fails_stops_no_other_and_sets_the_exit_code(gpu, faked, found_gpu, tmp_path):
     faked.fail["training (random, GPU)"] = "RuntimeError: no memory"
-    assert gpu.main(["--out", str(tmp_path), "--lego", str(tmp_path / "lego")]) == 1
-    page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
+    page = measure(gpu, tmp_path, "--lego", str(tmp_path / "lego"), code=1)
     assert "* training (random, GPU): RuntimeError: no memory\n" in page
     assert faked.begun[-1] == gpu.PARTS[-1].name
     assert "xplanes download dnerf" in page  # There is no lego.
@@ -118,16 +116,14 @@ def test_a_part_that_fails_stops_no_other_and_sets_the_exit_code(gpu, faked, fou
 
 def test_parts_that_do_not_fit_into_the_minutes_are_left_out(gpu, faked, found_gpu, tmp_path):
     faked.seconds = 60.0
-    assert gpu.main(["--out", str(tmp_path), "--minutes", "4"]) == 0
-    page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
+    page = measure(gpu, tmp_path, "--minutes", "4")
     # Of 225 seconds three parts leave 45: enough for one that needs 40, not for one that needs 60.
     assert len(faked.begun) == 4, faked.begun
     assert "Too little was left of the minutes: training (random, GPU); " in page
 
 
 def test_without_a_gpu_the_page_says_what_is_missing(gpu, faked, tmp_path):
-    assert gpu.main(["--out", str(tmp_path)]) == 0
-    page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
+    page = measure(gpu, tmp_path)
     begun = {part.name for part in gpu.PARTS if not part.needs_gpu}
     assert set(faked.begun) == begun
     assert "No CUDA GPU was found: training (random, GPU); " in page
@@ -161,33 +157,34 @@ def test_marching_agrees_with_its_twin(gpu, tmp_path):
     assert [figure.table for figure in record.figures] == ["accuracy"]
 
 
-def test_a_process_that_ends_early_leaves_one_line(gpu, monkeypatch, tmp_path, capsys):
-    part = gpu.PARTS[0]
-    args = SimpleNamespace(work=tmp_path, lego=Path("lego"))
+@pytest.fixture
+def begin(gpu, monkeypatch, tmp_path):
+    """Runs a part whose process is another program."""
     real = subprocess.run
 
-    def ends(command, **options):
-        program = "print('first'); print('out of memory'); raise SystemExit(3)"
-        return real([sys.executable, "-c", program], **options)
+    def begin(part, program, left):
+        def other(command, **options):
+            return real([sys.executable, "-c", program], **options)
 
-    monkeypatch.setattr(subprocess, "run", ends)
-    outcome = gpu.run_part(part, args, gpu=True, left=100)
+        monkeypatch.setattr(gpu, "PARTS", (part,))
+        monkeypatch.setattr(subprocess, "run", other)
+        args = SimpleNamespace(work=tmp_path, lego=Path("lego"))
+        return gpu.run_part(part, args, gpu=True, left=left)
+
+    return begin
+
+
+def test_a_process_that_ends_early_leaves_one_line(gpu, begin, capsys):
+    program = "print('first'); print('out of memory'); raise SystemExit(3)"
+    outcome = begin(gpu.PARTS[0], program, 100)
     assert outcome.record.error == "ended with code 3, last line: out of memory"
     assert "first" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("limit", "failed"), [(1.0, True), (50.0, False)])
-def test_a_part_that_takes_too_long_is_stopped(gpu, monkeypatch, tmp_path, limit, failed):
+def test_a_part_that_takes_too_long_is_stopped(gpu, begin, limit, failed):
     part = gpu.Part("kernels", "slow", limit=limit)
-    monkeypatch.setattr(gpu, "PARTS", (part,))
-    real = subprocess.run
-
-    def sleeps(command, **options):
-        return real([sys.executable, "-c", "import time; time.sleep(60)"], **options)
-
-    monkeypatch.setattr(subprocess, "run", sleeps)
-    args = SimpleNamespace(work=tmp_path, lego=Path("lego"))
-    outcome = gpu.run_part(part, args, gpu=True, left=1.0)
+    outcome = begin(part, "import time; time.sleep(60)", 1.0)
     assert outcome.record.error == ("stopped after 1 s" if failed else "")
     assert outcome.left_out == ("" if failed else "The minutes ran out 1 s after it had begun")
 
@@ -195,11 +192,10 @@ def test_a_part_that_takes_too_long_is_stopped(gpu, monkeypatch, tmp_path, limit
 @pytest.mark.slow
 def test_the_script_runs_without_a_gpu(tmp_path):
     pytest.importorskip("triton", reason="triton is not installed")
-    script = [sys.executable, str(FOLDER / "gpu.py"), "--out", str(tmp_path)]
+    script = [sys.executable, str(ROOT / "benchmarks" / "gpu.py"), "--out", str(tmp_path)]
     done = subprocess.run(script, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    page = (tmp_path / "gpu.md").read_text(encoding="utf-8")
-    assert page in done.stdout
+    assert (tmp_path / "gpu.md").read_text(encoding="utf-8") in done.stdout
     figures = rows(tmp_path)
     assert float(figures["training", "random, CPU: PSNR"]["value"]) > 20
     errors = {

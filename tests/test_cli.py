@@ -2,7 +2,9 @@
 
 import json
 import sys
+from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -21,19 +23,7 @@ def test_evaluate_as_a_program(trained_run, tmp_path):
     assert lines[0] == f"run         {trained_run}"
     assert lines[1].startswith("checkpoint  last.ckpt, step 40")
     scores = json.loads((trained_run / "evaluation_test.json").read_text())
-    metrics = json.loads((trained_run / "metrics.json").read_text())
-    assert scores["test"] == pytest.approx(metrics["test"], abs=1e-6)
-    assert f"{metrics['test']['psnr']:.2f}" in lines[-2]
-
-
-def test_render(trained_run, tmp_path, capsys):
-    out = tmp_path / "video.webp"
-    options = ["--path", "fixed", "--time", "sweep", "--frames", "2", "--size", "16"]
-    assert main(["render", str(trained_run), *options, "--out", str(out)]) == 0
-    assert out.is_file()
-    printed = capsys.readouterr().out
-    assert "last.ckpt, step 40" in printed
-    assert f"wrote {out}" in printed
+    assert f"{scores['test']['psnr']:.2f}" in lines[-2]
 
 
 def test_table(trained_run, tmp_path, capsys):
@@ -42,9 +32,7 @@ def test_table(trained_run, tmp_path, capsys):
 
 
 def test_download_says_how_to_continue(tmp_path, monkeypatch, capsys):
-    from xplanes.tools import download
-
-    monkeypatch.setattr(download, "download_dnerf", lambda root: root)
+    monkeypatch.setattr("xplanes.tools.download.download_dnerf", lambda root: root)
     assert main(["download", "dnerf", "--root", str(tmp_path)]) == 0
     assert f"data.root={tmp_path}" in capsys.readouterr().out
 
@@ -57,13 +45,12 @@ def test_download_says_how_to_continue(tmp_path, monkeypatch, capsys):
         (["render", "{run}", "--out", "a.gif"], "a video must end in .webp"),
         (["table", "{tmp}"], "no runs in it"),
         (["view", "{run}", "--port", "70000"], "--port 70000"),
+        (["sheet", "{run}", "--steps", "x"], "--steps x: must be numbers"),
     ],
 )
 def test_known_errors_are_one_line(arguments, words, trained_run, tmp_path, capsys):
-    filled = [text.format(tmp=tmp_path, run=trained_run) for text in arguments]
-    code = main(filled)
+    assert main([text.format(tmp=tmp_path, run=trained_run) for text in arguments]) == 1
     error = capsys.readouterr().err
-    assert code == 1
     assert error.startswith("error: ")
     assert words in error
     assert "Traceback" not in error
@@ -72,47 +59,49 @@ def test_known_errors_are_one_line(arguments, words, trained_run, tmp_path, caps
 def test_a_disk_that_takes_nothing_is_said_before_anything_is_rendered(
     trained_run, tmp_path, monkeypatch, capsys
 ):
-    from xplanes.tools import render
-
-    monkeypatch.setattr(render, "render_path", lambda *_, **__: pytest.fail("rendered first"))
+    never = Mock(side_effect=AssertionError("rendered first"))
+    monkeypatch.setattr("xplanes.tools.render.render_path", never)
     (tmp_path / "file").write_text("in the way")
     target = tmp_path / "file" / "video.webp"
     assert main(["render", str(trained_run), "--out", str(target)]) == 1
     assert capsys.readouterr().err.startswith("error: ")
 
 
-def test_a_missing_extra_is_named(trained_run, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    assert main(["view", str(trained_run)]) == 1
-    assert 'pip install -e ".[viewer]"' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("kind", [DeviceError, GaussianError, ZeroDivisionError])
-def test_what_happens_while_rendering_is_one_line_unless_nobody_foresaw_it(
-    kind, trained_run, monkeypatch, capsys
+@pytest.mark.parametrize(
+    ("module", "extra", "command", "options"),
+    [
+        ("viser", "viewer", "view", []),
+        ("imageio_ffmpeg", "video", "render", ["--out", "video.mp4"]),
+        ("skimage.measure", "export", "export", []),
+        ("trimesh", "export", "export", ["--what", "web"]),
+    ],
+)
+def test_a_missing_extra_is_named(
+    module, extra, command, options, trained_run, monkeypatch, capsys
 ):
-    from xplanes.tools import runs
+    monkeypatch.setitem(sys.modules, module, None)
+    assert main([command, str(trained_run), *options]) == 1
+    assert f'pip install -e ".[{extra}]"' in capsys.readouterr().err
 
-    def broken(*_: object, **__: object) -> None:
-        raise kind("what, and the way out")
 
-    monkeypatch.setattr(runs, "load_run", broken)
-    if kind is ZeroDivisionError:
-        with pytest.raises(ZeroDivisionError):
-            main(["evaluate", str(trained_run)])
-        return
-    assert main(["evaluate", str(trained_run)]) == 1
-    assert capsys.readouterr().err == "error: what, and the way out\n"
+def test_what_happens_while_rendering_is_one_line_unless_nobody_foresaw_it(
+    trained_run, monkeypatch, capsys
+):
+    evaluate = partial(main, ["evaluate", str(trained_run)])
+    for kind in (DeviceError, GaussianError, ZeroDivisionError):
+        broken = Mock(side_effect=kind("what, and the way out"))
+        monkeypatch.setattr("xplanes.tools.runs.load_run", broken)
+        if kind is ZeroDivisionError:
+            with pytest.raises(kind):
+                evaluate()
+        else:
+            assert evaluate() == 1
+            assert capsys.readouterr().err == "error: what, and the way out\n"
 
 
 def test_the_view_ends_with_ctrl_c(trained_run, monkeypatch, capsys):
     pytest.importorskip("viser")
-    from xplanes.tools.viewer import Viewer
-
-    def interrupted(self: Viewer) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Viewer, "run", interrupted)
+    monkeypatch.setattr("xplanes.tools.viewer.Viewer.run", Mock(side_effect=KeyboardInterrupt))
     assert main(["view", str(trained_run), "--port", "18090"]) == 0
     printed = capsys.readouterr().out
     assert "http://localhost:18090" in printed

@@ -19,6 +19,7 @@ import pytest
 import yaml
 
 from tests.training.runs import changed, small_config
+from tests.warm import ROOT
 from xplanes import __version__
 from xplanes.cli import build_parser, further_commands
 from xplanes.config import compose_plain, near_names
@@ -29,8 +30,8 @@ from xplanes.tools.published import OWN, PUBLISHED
 from xplanes.tools.sweep import SCORES
 from xplanes.tools.table import write_tables
 
-ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +53,7 @@ def test_addresses_and_version_are_the_same_wherever_they_stand(generator):
     for name in generator["ADDRESSED"]:
         text = (ROOT / name).read_text(encoding="utf-8")
         assert text == addressed(name), "run: python docs/generate.py"
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert f"version = {{{__version__}}}" in text
+    assert f"version = {{{__version__}}}" in TEXTS[ROOT / "README.md"]
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert cited["version"] == __version__
 
@@ -78,7 +78,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
 
 
 def test_the_configuration_page_says_what_every_setting_means():
-    text = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+    text = TEXTS[ROOT / "docs" / "configuration.md"]
     rows = re.findall(r"^\| `([\w.]+)` \| (.*?) \| (.*) \|$", text, re.MULTILINE)
     assert len(rows) > 250
     for key, meaning, value in rows:
@@ -87,13 +87,13 @@ def test_the_configuration_page_says_what_every_setting_means():
 
 
 def test_links_between_pages_lead_somewhere():
-    for page in PAGES:
-        for link in re.findall(r"\]\((?!https?:)([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
+    for page, text in TEXTS.items():
+        for link in re.findall(r"\]\((?!https?:)([^)#]+)[^)]*\)", text):
             assert (page.parent / link).exists(), f"{page.name}: {link}"
 
 
 def test_the_api_page_has_the_signatures_of_all_that_it_lists():
-    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    text = TEXTS[ROOT / "docs" / "api.md"]
     found = re.findall(r"```python\n((?:(?!```).)+)```\n\n::: ([\w.]+)", text, re.DOTALL)
     assert len(found) == len(re.findall(r"^::: ", text, re.MULTILINE)) > 20
     for code, path in found:
@@ -124,9 +124,9 @@ def commands() -> list[list[str]]:
     """Arguments of the program in every such line."""
     return [
         [*(["train"] if call["train"] else []), *shlex.split(call["rest"] or "", comments=True)]
-        for page in PAGES
+        for page, text in TEXTS.items()
         if page.name != "CONTRIBUTING.md"  # Its commands name components that the reader adds.
-        for call in CALL.finditer(page.read_text(encoding="utf-8"))
+        for call in CALL.finditer(text)
     ]
 
 
@@ -155,8 +155,8 @@ def test_other_commands_of_the_pages_parse():
 
 def test_shells_leave_the_commands_of_the_pages_alone():
     # zsh, the shell of every Mac, takes brackets, braces, * and ? outside of quotes for file names.
-    for page in PAGES:
-        for line in page.read_text(encoding="utf-8").splitlines():
+    for page, text in TEXTS.items():
+        for line in text.splitlines():
             if not re.match(r"    (\w+=\S+ )*(python|xplanes) ", line):
                 continue
             words = line.partition("   #")[0]
@@ -174,14 +174,14 @@ FILES = {".ckpt", ".pth", ".safetensors", ".py", ".yaml", ".pt"}
 
 
 def test_keys_in_the_text_of_the_pages_exist():
-    text = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+    text = TEXTS[ROOT / "docs" / "configuration.md"]
     known = set(re.findall(r"^\| `([\w.]+)` \|", text, re.MULTILINE))
     known |= {key.rpartition(".")[0] for key in known}
     named = [
         (page.name, key)
-        for page in PAGES
+        for page, text in TEXTS.items()
         if page.name != "glossary.md"  # It lists the keys of metrics.json.
-        for key in KEY.findall(page.read_text(encoding="utf-8"))
+        for key in KEY.findall(text)
         if Path(key).suffix not in FILES
     ]
     assert len(named) > 12
@@ -196,8 +196,7 @@ CODE = re.compile(r"`(xplanes(?:\.\w+)+)`")
 
 
 def test_code_named_in_the_text_of_the_pages_exists():
-    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
-    named = sorted(set(CODE.findall(text)))
+    named = sorted(set(CODE.findall("\n".join(TEXTS.values()))))
     assert len(named) > 12
     for name in named:
         assert pkgutil.resolve_name(name), name
@@ -228,7 +227,7 @@ def test_the_glossary_has_every_column_and_key_that_a_run_writes(scenes, tmp_pat
     assert "drift" in columns
     keyed = (tmp_path / "runs" / "table.csv").read_text(encoding="utf-8").splitlines()[0]
     rows = (written / "curve.csv").read_text(encoding="utf-8").splitlines()[0]
-    page = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    page = TEXTS[ROOT / "docs" / "glossary.md"]
     known = {text.rpartition(".")[2] for text in re.findall(r"`([^`]+)`", page)}
     names = [*keys_of(metrics), *keys_of(record), *columns, *keyed.split(","), *rows.split(",")]
     names += [*OWN, *PUBLISHED, *(score.heading for score in SCORES.values()), *SCORES]

@@ -3,16 +3,17 @@
 import warnings
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
-import lightning
 import numpy as np
 import pytest
 from lightning.pytorch import callbacks
 from lightning.pytorch.loggers import CSVLogger
 
 from tests.baselines.runs import TINEUVOX, baseline_config
+from tests.test_lightning import PLAIN, fit
 from tests.training.runs import NO_CURVE, checkpoint, metrics, small_config
-from xplanes import RadianceModule, SceneDataModule
+from xplanes import RadianceModule
 from xplanes.errors import ConfigError
 from xplanes.files import read_rows
 from xplanes.run import run
@@ -21,8 +22,6 @@ from xplanes.tools.runs import load_run
 from xplanes.training.csv_logger import CSVLogger as OwnCSVLogger
 from xplanes.training.evaluation import Evaluation
 from xplanes.training.fit import Trainer
-
-PLAIN = {"accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False}
 
 
 class Numbers(callbacks.Callback):
@@ -67,12 +66,9 @@ def test_what_would_train_wrongly_is_refused(options, words):
 
 
 @pytest.mark.parametrize(("options", "words"), WRONG_EVERYWHERE)
-def test_a_plain_trainer_that_would_train_wrongly_is_refused(options, words, scenes):
-    config = small_config(scenes)
-    module, data = RadianceModule(config), SceneDataModule(config["data"])
-    trainer = lightning.Trainer(max_steps=2, logger=False, **PLAIN, **options)
+def test_a_plain_trainer_that_would_train_wrongly_is_refused(options, words, scenes, tmp_path):
     with pytest.raises(ConfigError, match=words):
-        trainer.fit(module, data)
+        fit(small_config(scenes), tmp_path, **options)
 
 
 @pytest.mark.parametrize(
@@ -82,14 +78,14 @@ def test_a_plain_trainer_that_would_train_wrongly_is_refused(options, words, sce
         ("model=gaussians_hexplane", "model.count=20", "model.resolution=8", "model.width=16"),
     ],
 )
-def test_averages_of_weights_that_change_their_shapes_are_refused(model, scenes):
+def test_averages_of_weights_that_change_their_shapes_are_refused(model, scenes, tmp_path):
     config = baseline_config(scenes, *model)
-    module, data = RadianceModule(config), SceneDataModule(config["data"])
     average = callbacks.EMAWeightAveraging(use_buffers=False)
-    trainer = lightning.Trainer(max_steps=2, logger=False, callbacks=[average], **PLAIN)
+    step = Mock()
+    watch = callbacks.LambdaCallback(on_train_batch_end=step)
     with pytest.raises(ConfigError, match=r"callbacks: EMAWeightAveraging: .*Model .*leave it out"):
-        trainer.fit(module, data)
-    assert trainer.global_step == 0
+        fit(config, tmp_path, callbacks=[average, watch], max_steps=2)
+    step.assert_not_called()
 
 
 def test_whole_floats_are_accepted():
@@ -161,14 +157,12 @@ def test_scores_are_of_the_averaged_weights_that_checkpoints_hold(scenes, tmp_pa
     assert abs(float(raw["psnr"]) - found["test"]["psnr"]) > 0.1
 
 
-def test_epochs_end_the_schedules_too(scenes):
+def test_epochs_end_the_schedules_too(scenes, tmp_path):
     config = small_config(scenes, "model.rays.per_batch=1024")
 
     def rates(**options: Any) -> tuple[int, list[float]]:
-        module, data = RadianceModule(config), SceneDataModule(config["data"])
-        trainer = lightning.Trainer(logger=False, enable_checkpointing=False, **PLAIN, **options)
-        trainer.fit(module, data)
-        return trainer.global_step, [group["lr"] for group in trainer.optimizers[0].param_groups]
+        used = fit(config, tmp_path, **options)
+        return used.global_step, [group["lr"] for group in used.optimizers[0].param_groups]
 
     steps, both = rates(max_epochs=1, max_steps=30_000)
     assert steps < 30_000
@@ -178,22 +172,13 @@ def test_epochs_end_the_schedules_too(scenes):
 def test_a_module_that_was_loaded_logs_as_a_fresh_one(scenes, tmp_path):
     config = small_config(scenes)
 
-    def fit(module: RadianceModule, folder: str, steps: int) -> lightning.Trainer:
-        trainer = lightning.Trainer(
-            max_steps=steps,
-            log_every_n_steps=4,
-            logger=CSVLogger(tmp_path / folder, name="", version="csv"),
-            limit_val_batches=0,
-            **PLAIN,
-        )
-        trainer.fit(module, SceneDataModule(config["data"]))
-        return trainer
-
-    fit(RadianceModule(config), "first", 6).save_checkpoint(tmp_path / "field.ckpt")
-    again = RadianceModule.load_from_checkpoint(tmp_path / "field.ckpt")
-    fit(again, "second", 9)
-    assert [row["step"] for row in rows(tmp_path / "first") if row["train/loss"]] == ["3"]
-    assert [row["step"] for row in rows(tmp_path / "second") if row["train/loss"]] == ["3", "7"]
+    module = RadianceModule(config)
+    for steps, logged in ((6, ["3"]), (9, ["3", "7"])):
+        log = CSVLogger(tmp_path / f"{steps}", name="", version="csv")
+        used = fit(config, tmp_path, module, max_steps=steps, log_every_n_steps=4, logger=log)
+        assert [row["step"] for row in rows(tmp_path / f"{steps}") if row["train/loss"]] == logged
+        used.save_checkpoint(tmp_path / "field.ckpt")
+        module = RadianceModule.load_from_checkpoint(tmp_path / "field.ckpt")
 
 
 CALLBACKS = "lightning.pytorch.callbacks"

@@ -3,6 +3,7 @@
 import dataclasses
 import re
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -72,26 +73,24 @@ CASES = {
 @pytest.fixture(params=CASES)
 def work(request, monkeypatch):
     """Tensors of this machine are taken for ones on a GPU."""
-    module, kernels, outcome = CASES[request.param]
+    module, *rest = CASES[request.param]
     monkeypatch.setattr(module, "cpu_loops", lambda tensor: False)
     monkeypatch.setattr(module, "gpu_kernels", lambda tensor: True)
     monkeypatch.setattr(backend, "_refused", set())
     module._kernels_hold.cache_clear()
-    yield request.param, module, kernels, outcome
+    yield request.param, module, *rest
     module._kernels_hold.cache_clear()
 
 
 def test_kernels_that_prove_themselves_are_used(work, monkeypatch, caplog):
     _, module, name, outcome = work
-    kernels, calls = getattr(module, name), []
-    monkeypatch.setattr(
-        module, name, lambda *given, **named: calls.append(given) or kernels(*given, **named)
-    )
+    calls = Mock(side_effect=getattr(module, name))
+    monkeypatch.setattr(module, name, calls)
     for _ in range(2):
         with torch.inference_mode():
             ours, theirs = outcome()
         torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-5)
-    assert len(calls) == 3  # One trial, two uses.
+    assert calls.call_count == 3  # One trial, two uses.
     assert not caplog.records
 
 
@@ -125,9 +124,7 @@ def test_kernels_that_fail_their_trial_are_not_used(work, monkeypatch, caplog, f
 
 
 def test_a_gpu_that_is_lost_in_a_trial_is_not_asked_again(work, monkeypatch):
-    def broken(*given, **named):
-        raise RuntimeError("an illegal memory access was encountered")
-
+    broken = Mock(side_effect=RuntimeError("an illegal memory access was encountered"))
     what, module, name, outcome = work
     monkeypatch.setattr(module, name, broken)
     monkeypatch.setattr(backend, "synchronize", broken)

@@ -1,7 +1,6 @@
 """With nothing but Lightning: its own Trainer, loggers, callbacks and checkpoints."""
 
 import copy
-import json
 import os
 import re
 import shutil
@@ -14,7 +13,8 @@ import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger
 
-from tests.training.runs import same_state, small_config
+from tests.training.runs import checkpoint, metrics, same_state, small_config
+from tests.warm import ROOT
 from xplanes import RadianceModule, SceneDataModule
 from xplanes.errors import ConfigError, SceneError
 from xplanes.experiment import Experiment
@@ -24,7 +24,6 @@ from xplanes.training.building import loss_terms
 from xplanes.training.evaluation import Evaluation
 from xplanes.training.fit import Trainer
 
-ROOT = Path(__file__).resolve().parents[1]
 CALLBACKS = "lightning.pytorch.callbacks"
 
 
@@ -40,6 +39,15 @@ def trainer(folder: Path, **options) -> lightning.Trainer:
     given = {"max_steps": 45, "default_root_dir": folder, "log_every_n_steps": 5, **PLAIN}
     given["logger"] = CSVLogger(folder, name="", version="csv")
     return lightning.Trainer(**given | options)
+
+
+def fit(
+    config: dict, folder: Path, module: lightning.LightningModule | None = None, **options
+) -> lightning.Trainer:
+    """A trainer that has trained a module, by default a fresh one, without scores."""
+    used = trainer(folder, **{"logger": False, "limit_val_batches": 0} | options)
+    used.fit(module or RadianceModule(config), SceneDataModule(config["data"]))
+    return used
 
 
 def logged(folder: Path) -> dict[str, list[float]]:
@@ -92,7 +100,6 @@ def test_validate_and_test_score_their_own_splits(fitted):
 
 
 def test_pixels_without_rays_are_background_in_every_score(fitted):
-    """As fisheye images have them at their corners."""
     _, module, data, _ = fitted
     batch = next(iter(data.test_dataloader()))
     assert "shown" not in batch
@@ -106,32 +113,10 @@ def test_pixels_without_rays_are_background_in_every_score(fitted):
 
 
 def test_no_number_of_steps_is_no_limit(tmp_path):
-    """Lightning's own Trainer ends after 1000 epochs."""
     options = {"accelerator": "cpu", "default_root_dir": tmp_path, "logger": False}
     options |= {"max_steps": -1, "max_seconds": 5.0}
     assert Trainer(**options).max_epochs == -1
     assert Trainer(**options, max_epochs=3).max_epochs == 3
-
-
-def test_a_resumed_fit_ends_with_the_same_numbers(config, tmp_path):
-    path = tmp_path / "half.ckpt"
-
-    class SaveAt13(Callback):
-        """In the middle of an epoch."""
-
-        def on_train_batch_end(self, trainer, *_) -> None:
-            if trainer.global_step == 13:
-                trainer.save_checkpoint(path)
-
-    def fit(checkpoint: Path | None, *callbacks: Callback) -> dict:
-        plain = {"logger": False, "enable_checkpointing": False, "limit_val_batches": 0}
-        used = trainer(tmp_path, max_steps=16, callbacks=list(callbacks), **plain)
-        module = RadianceModule(config)
-        used.fit(module, SceneDataModule(config["data"]), ckpt_path=checkpoint)
-        assert used.global_step == 16
-        return module.state_dict()
-
-    same_state(fit(None, SaveAt13()), fit(path))
 
 
 def test_callbacks_that_watch_a_metric_see_every_evaluation(scenes, tmp_path):
@@ -144,11 +129,9 @@ def test_callbacks_that_watch_a_metric_see_every_evaluation(scenes, tmp_path):
         "keep": watched | keep | {"dirpath": str(tmp_path)},
     }
     run(config, tmp_path / "run", [], resume=False)
-    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     # The evaluation after two fifths of the steps is not 99 dB better than the one before.
-    assert found["step"] == 8
-    kept = torch.load(tmp_path / "mine.ckpt", weights_only=True)
-    assert kept["global_step"] == 8
+    assert metrics(tmp_path / "run")["step"] == 8
+    assert torch.load(tmp_path / "mine.ckpt", weights_only=True)["global_step"] == 8
 
 
 class Lines(Logger):
@@ -165,9 +148,8 @@ class Lines(Logger):
 
 @pytest.mark.parametrize("limits", [{"max_steps": 4}, {"max_epochs": 2, "limit_train_batches": 2}])
 def test_evaluations_join_a_fit_that_builds_the_field(config, tmp_path, limits):
-    fit = trainer(tmp_path, **limits, callbacks=[Evaluation(at=[0, 0.5])])
-    module, data = RadianceModule(config), SceneDataModule(config["data"])
-    fit.fit(module, data)
+    callbacks = [Evaluation(at=[0, 0.5])]
+    fit(config, tmp_path, logger=True, limit_val_batches=1.0, callbacks=callbacks, **limits)
     assert [row["step"] for row in read_rows(tmp_path / "curve.csv")] == ["0", "2", "4"]
 
 
@@ -180,7 +162,6 @@ def test_loggers_need_no_folder(tmp_path):
 
 
 def test_gradients_are_clipped_and_accumulated(config, tmp_path):
-    """Regularisers count towards the norm, once for each update."""
     norms: list[float] = []
 
     class Watch(Callback):
@@ -192,9 +173,9 @@ def test_gradients_are_clipped_and_accumulated(config, tmp_path):
     options = {"gradient_clip_val": 1e-3, "accumulate_grad_batches": 2, "callbacks": [Watch()]}
     # The third batch ends the epoch, and hence a step; every second step is logged.
     options |= {"limit_train_batches": 3, "log_every_n_steps": 2}
-    used = trainer(tmp_path, max_steps=4, limit_val_batches=0, **options)
+    options |= {"logger": CSVLogger(tmp_path, name="", version="csv")}
     module = RadianceModule(config)
-    used.fit(module, SceneDataModule(config["data"]))
+    used = fit(config, tmp_path, module, max_steps=4, **options)
     assert (used.global_step, module.batches) == (4, 6)
     assert len(logged(tmp_path)["train/loss"]) == 2
     assert max(norms) < 1.001e-3
@@ -210,11 +191,10 @@ def test_a_fit_after_one_that_was_broken_off_begins_with_low_rates(config, tmp_p
             if len(rates) == 1:
                 raise RuntimeError("a fault of one's own")
 
-    module, data = RadianceModule(config), SceneDataModule(config["data"])
-    options = {"logger": False, "limit_val_batches": 0, "callbacks": [BreaksOff()]}
+    module, callbacks = RadianceModule(config), [BreaksOff()]
     with pytest.raises(RuntimeError, match="a fault of one's own"):
-        trainer(tmp_path, **options).fit(module, data)
-    trainer(tmp_path, **options | {"max_steps": 2}).fit(module, data)
+        fit(config, tmp_path, module, callbacks=callbacks)
+    fit(config, tmp_path, module, callbacks=callbacks, max_steps=2)
     assert rates[0] == rates[1] < rates[2]
 
 
@@ -287,8 +267,7 @@ class Other(lightning.LightningModule):
 
 def test_the_data_serve_other_modules(config, tmp_path):
     module = Other()
-    data = SceneDataModule(config["data"])
-    trainer(tmp_path, logger=False, limit_val_batches=0).fit(module, data)
+    fit(config, tmp_path, module)
     assert float(module.colour.min()) > 0.5  # Most of the images is white.
 
 
@@ -330,7 +309,7 @@ def test_the_page_on_your_own_trainer_runs(config, tmp_path, monkeypatch):
     }
     names = execute("own_trainer.md", ".*?", config, short)
     assert names["trainer"].global_step == 12
-    kept = torch.load(tmp_path / "checkpoints" / "best.ckpt", weights_only=True)
+    kept = checkpoint(tmp_path, "best")
     averaged, last = kept["state_dict"], kept["current_model_state"]
     assert not torch.equal(averaged["field.space"], last["field.space"])
     assert torch.equal(averaged["grid.occupied"], last["grid.occupied"])
@@ -381,11 +360,10 @@ def test_processes_do_not_send_each_other_the_grid_before_each_step(config, tmp_
         def on_train_batch_end(self, trainer, *_):
             sent.append({buffer.data_ptr() for buffer in trainer.model.modules_buffers})
 
-    module, data = RadianceModule(config), SceneDataModule(config["data"])
+    module, options = RadianceModule(config), {"strategy": "ddp", "devices": 1}
     with mock.patch.dict(os.environ):  # Lightning notes ranks and ports there.
-        shared = trainer(tmp_path, max_steps=2, strategy="ddp", devices=1, callbacks=[Watch()])
         try:
-            shared.fit(module, data)
+            fit(config, tmp_path, module, max_steps=2, callbacks=[Watch()], **options)
         finally:
             torch.distributed.destroy_process_group()
     assert len(sent) == 2
@@ -396,10 +374,9 @@ def test_processes_do_not_send_each_other_the_grid_before_each_step(config, tmp_
 
 def test_what_a_trainer_of_ours_settles_for_gpus(tmp_path):
     before = torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
-    options = {"accelerator": "cpu", "default_root_dir": tmp_path, "logger": False}
     try:
         for tf32, products in ((True, "high"), (False, "highest")):
-            Trainer(**options, tf32=tf32)
+            Trainer(accelerator="cpu", default_root_dir=tmp_path, logger=False, tf32=tf32)
             assert torch.get_float32_matmul_precision() == products
             assert torch.backends.cudnn.allow_tf32 is tf32
     finally:

@@ -182,8 +182,7 @@ def test_what_a_step_shows_is_read_now_and_then(fake_gpu, trained_once):
 def test_slots_are_those_of_the_next_batch():
     module = RadianceModule.compose("lrm=none", "model.rays.samples_per_batch=8192")
     module.build(ball_scene())
-    module._trainer = Mock()
-    module.rays = 64
+    module._trainer, module.rays = Mock(), 64
     with (
         patch.object(module.tally, "read", return_value=(64, 64 * 16)),
         patch.object(module.sampler, "expect") as expected,
@@ -265,7 +264,6 @@ def test_warming_up_does_all_of_a_step_and_changes_nothing(fake_gpu, trained_onc
 
 
 def test_the_clock_counts_what_the_device_has_still_to_do(fake_gpu, monkeypatch):
-    """Whoever looks at the time waits for the device first; steps do not."""
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(torch.fake, "synchronize", lambda device: now.append(now.pop() + 0.5))
@@ -283,31 +281,23 @@ def test_the_clock_counts_what_the_device_has_still_to_do(fake_gpu, monkeypatch)
 
 
 def test_processes_that_share_a_run_end_in_time_however_short_their_epochs_are():
-    batches = SimpleNamespace(total_batch_idx=-1)
-    trainer = SimpleNamespace(
-        should_stop=False,
-        world_size=2,
-        fit_loop=SimpleNamespace(epoch_loop=batches),
-        strategy=SimpleNamespace(
-            reduce=lambda number, reduce_op: number,
-            reduce_boolean_decision=lambda decision, all: decision,
-        ),
-    )
-    module = SimpleNamespace(device=torch.device("cpu"))
+    trainer, module = Mock(should_stop=False, world_size=2), Mock(device=torch.device("cpu"))
+    trainer.strategy.reduce = lambda number, reduce_op: number
+    trainer.strategy.reduce_boolean_decision = lambda decision, all: decision
     clock, interrupt = TrainingClock(max_seconds=1e-9), Interrupt()
     clock.on_train_start(trainer, module)
-
-    def train(count):
-        for number in range(count):
-            batches.total_batch_idx += 1
-            clock.on_train_batch_end(trainer, module, None, None, number % 5)
-            interrupt.on_train_batch_end(trainer, module, None, None, number % 5)
-
     interrupt.asked = True
-    train(SHARED - 1)
+
+    def train(number):
+        trainer.fit_loop.epoch_loop.total_batch_idx = number
+        for callback in (clock, interrupt):
+            callback.on_train_batch_end(trainer, module, None, None, number % 5)
+
+    for number in range(SHARED - 1):
+        train(number)
     assert not trainer.should_stop
     with pytest.raises(Stopped):
-        train(1)
+        train(SHARED - 1)
     assert trainer.should_stop
 
 
@@ -359,22 +349,17 @@ class Upkeep(Callback):
 
     def __init__(self, monkeypatch):
         self.sweeps, self.looks, self.rates = [], [], []
-        self.step = 0
-        for name, steps in (("sweep", self.sweeps), ("update", self.looks)):
-            monkeypatch.setattr(OccupancyGrid, name, self.noting(name, steps))
-        monkeypatch.setattr(OccupancyGrid, "update_by", self.noting("update_by", self.looks))
+        noted = {"sweep": self.sweeps, "update": self.looks, "update_by": self.looks}
+        for name, steps in noted.items():
+            real = getattr(OccupancyGrid, name)
 
-    def noting(self, name, steps):
-        real = getattr(OccupancyGrid, name)
+            def noting(grid, *given, real=real, steps=steps):
+                steps.append(len(self.rates))
+                return real(grid, *given)
 
-        def noted(grid, *given):
-            steps.append(self.step)
-            return real(grid, *given)
-
-        return noted
+            monkeypatch.setattr(OccupancyGrid, name, noting)
 
     def on_train_batch_end(self, trainer, module, *rest):
-        self.step = trainer.global_step
         self.rates.append(module.optimizers().param_groups[0]["lr"])
 
 

@@ -11,6 +11,7 @@ import yaml
 
 from tests.refusals import assert_refused
 from tests.training.runs import SMALL, metrics, small_config
+from tests.warm import ROOT
 from xplanes import RadianceModule, SceneDataModule, __version__
 from xplanes.components import build, plugins
 from xplanes.config import compose_plain
@@ -120,31 +121,26 @@ def test_a_run_of_somebody_else_names_no_classes_by_itself(config, tmp_path):
             load(given)
 
 
+DERIVED = r": must be a class derived from xplanes\.models\.base\.ModelSettings"
+
+
 @pytest.mark.parametrize(
-    ("target", "words"),
+    ("key", "value", "words"),
     [
-        ("os.system", "only classes of xplanes, lightning, torchmetrics, tests.plugins"),
-        ("tests.plugins.opacity_loss.OpacityLoss", "must be a class derived from .*ModelSettings"),
-        ("tests.plugins.opacity_loss.Nothing", "there is no such class"),
-        ("xplanes.models.base.torch", "must be a class derived from"),
-        ("tests.plugins.blob.RadianceField", "must be a class derived from"),
+        ("_target_", "os.system", "=os.system: .*only classes of xplanes, .*, tests.plugins"),
+        ("_target_", "tests.plugins.opacity_loss.OpacityLoss", f"=.*OpacityLoss{DERIVED}"),
+        ("_target_", "tests.plugins.opacity_loss.Nothing", "=.*Nothing: there is no such class"),
+        ("_target_", "xplanes.models.base.torch", f"=xplanes.models.base.torch{DERIVED}"),
+        ("_target_", "tests.plugins.blob.RadianceField", f"=.*RadianceField{DERIVED}"),
+        ("width", -1.0, r"=-1\.0: must be above 0"),
+        ("widht", 2, ": there is no such .* mean width"),
     ],
 )
-def test_classes_that_may_not_stand_there_are_refused(config, tmp_path, target, words):
-    config["model"]["_target_"] = target
-    with pytest.raises(ConfigError, match=rf"model\._target_={target}: .*{words}"):
+def test_classes_and_settings_of_plugins_are_checked_alike(config, tmp_path, key, value, words):
+    config["model"][key] = value
+    with pytest.raises(ConfigError, match=rf"model\.{key}{words}"):
         run(config, tmp_path / "run", [], resume=False)
     assert not (tmp_path / "run" / "run.json").exists()
-
-
-def test_settings_of_plugins_are_checked_alike(config, tmp_path):
-    for changes, words in (
-        ({"width": -1.0}, r"model\.width=-1\.0: must be above 0"),
-        ({"width": 1, "widht": 2}, r"model\.widht: there is no such .* mean width"),
-    ):
-        config["model"] |= changes
-        with pytest.raises(ConfigError, match=words):
-            run(config, tmp_path / "run", [], resume=False)
 
 
 def test_a_module_that_is_not_there_is_said(config, tmp_path):
@@ -152,7 +148,12 @@ def test_a_module_that_is_not_there_is_said(config, tmp_path):
         run(config | {"plugins": ["not_here"]}, tmp_path / "run", [], resume=False)
 
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "CONTRIBUTING.md"
+PAGE = ROOT / "docs" / "CONTRIBUTING.md"
+
+
+def section(name: str) -> str:
+    """A section of the page."""
+    return PAGE.read_text(encoding="utf-8").split(f"### {name}\n")[1].split("\n### ")[0]
 
 
 @pytest.fixture
@@ -162,8 +163,8 @@ def example(
     """Writes an example of the docs to files as they say, and gives its configuration."""
     project = tmp_path / "my_project"
 
-    def write(section: str, group: str, name: str, *changes: str) -> dict:
-        text = PAGE.read_text(encoding="utf-8").split(f"### {section}\n")[1].split("\n### ")[0]
+    def write(title: str, group: str, name: str, *changes: str) -> dict:
+        text = section(title)
         (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
         (settings,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
         package, folder = project / "my_package", project / "conf" / group
@@ -221,8 +222,7 @@ def test_the_variant_and_the_loss_of_the_docs_train(example, tmp_path):
 
 
 def test_the_settings_of_the_docs_data_format_are_complete(scenes):
-    text = PAGE.read_text(encoding="utf-8").split("### A data format\n")[1].split("\n### ")[0]
-    (block,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    (block,) = re.findall(r"```yaml\n(.*?)```", section("A data format"), re.DOTALL)
     with plugins(["tests.plugins"]):
         scene = build(yaml.safe_load(block), SceneSettings, "data").load(("train",))
     assert len(scene.splits["train"]) == 6

@@ -5,12 +5,12 @@ import platform
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from tests.warm import ROOT
 from xplanes.process import KEEP, NOWHERE, WAIT, defaults
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize("own", [{"OMP_WAIT_POLICY": "ACTIVE"}, {"GOMP_SPINCOUNT": "0"}])
@@ -21,10 +21,8 @@ def test_a_users_own_setting_stands_alone(own):
 
 
 def test_who_has_no_home_gets_one_that_takes_no_folders(monkeypatch):
-    def homeless():
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.setattr(Path, "home", homeless)
+    problem = RuntimeError("Could not determine home directory.")
+    monkeypatch.setattr(Path, "home", Mock(side_effect=problem))
     assert defaults({}) == WAIT | KEEP | NOWHERE
     with pytest.raises(OSError, match=NOWHERE["HOME"]):
         Path(NOWHERE["HOME"], ".cache").mkdir(parents=True)

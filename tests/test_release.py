@@ -1,13 +1,19 @@
 """What builds, tests and publishes a release: pinned, with few rights, complete."""
 
+import os
 import re
+import subprocess
+import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-ROOT = Path(__file__).resolve().parents[1]
+from tests.training.runs import SMALL
+from tests.warm import ROOT
+
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 
 
@@ -15,18 +21,16 @@ def read(path: Path) -> dict[Any, Any]:
     return yaml.safe_load(path.read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
-def test_actions_are_pinned_by_commit_and_name_their_version(path):
-    lines = re.findall(r"uses: (.+)", path.read_text(encoding="utf-8"))
-    assert lines
-    for line in lines:
-        assert re.fullmatch(r"(\./\S+|[\w.-]+/[\w./-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+)", line), line
-
-
-def test_one_version_of_an_action_is_used_everywhere():
-    text = "".join(path.read_text(encoding="utf-8") for path in WORKFLOWS)
-    pins = set(re.findall(r"uses: ([\w.-]+/[\w./-]+)@(\S+)", text))
-    assert len(pins) == len({name for name, _ in pins})
+def test_actions_are_pinned_by_commit_in_one_version_which_is_named():
+    pins = {}
+    for path in WORKFLOWS:
+        lines = re.findall(r"uses: (.+)", path.read_text(encoding="utf-8"))
+        assert lines, path
+        for line in lines:
+            pinned = r"\./\S+|([\w.-]+/[\w./-]+)@([0-9a-f]{40} # v\d+\.\d+\.\d+)"
+            found = re.fullmatch(pinned, line)
+            assert found, f"{path}: {line}"
+            assert pins.setdefault(found[1], found[2]) == found[2], line
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
@@ -78,3 +82,81 @@ def test_the_image_runs_as_a_user_without_rights():
     torch = re.search(r"^ARG TORCH=(\S+)", text, re.MULTILINE)
     assert torch
     assert f"torch=={torch[1]}" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+# The wheel, installed without the repository and used from an empty folder
+
+
+def run(*command: str, cwd: Path, **environment: str) -> str:
+    """What a command prints; it must succeed."""
+    done = subprocess.run(
+        command,
+        cwd=cwd,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that holds what the wheel installs."""
+    place = tmp_path_factory.mktemp("wheel")
+    run(sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(place), cwd=ROOT)
+    (wheel,) = place.glob("xplanes-*.whl")
+    with zipfile.ZipFile(wheel) as content:
+        content.extractall(place / "site")
+    return place / "site"
+
+
+COMMANDS = """
+import sys
+from importlib.metadata import entry_points
+import xplanes
+from xplanes.synthetic.demo import write
+
+write.VIDEO_FRAMES = 2
+(script,) = entry_points(group="console_scripts", name="xplanes")
+main = script.load()
+print(xplanes.__file__)
+for arguments in {!r}:
+    try:
+        code = main(arguments)
+    except SystemExit as end:
+        code = end.code
+    assert not code, arguments
+"""
+
+
+@pytest.mark.slow
+def test_commands_work_from_an_empty_folder(installed, tmp_path):
+    # The compiled loops would take half a minute to compile for this copy.
+    settings = {"PYTHONPATH": str(installed), "XPLANES_CPU_LOOPS": "0"}
+    commands = [
+        ["--help"],
+        ["train", "model=nine_planes", "lrm=xlarge", "--cfg", "job"],
+        ["train", *SMALL, "trainer.max_steps=5", "hydra.run.dir=outputs/run"],
+        "render outputs/run --frames 2 --size 16 --out video.webp".split(),
+        ["table", "outputs"],
+    ]
+    code = COMMANDS.format(commands)
+    printed = run(sys.executable, "-c", code, cwd=tmp_path, **settings)
+    for words in (
+        str(installed / "xplanes" / "__init__.py"),
+        *("pretrain-lrm", "architecture: openlrm-large-1.1", "psnr", "xplanes train resume="),
+        *("wrote video.webp", "1 runs: 1 finished"),
+    ):
+        assert words in printed, words
+    assert {path.name for path in tmp_path.iterdir()} == {"data", "outputs", "video.webp"}
+
+
+def test_the_page_and_its_scripts_are_shipped():
+    builder = pytest.importorskip("hatchling.builders.wheel").WheelBuilder(str(ROOT))
+    shipped = {Path(file.distribution_path) for file in builder.recurse_included_files()}
+    page = {path.relative_to(ROOT) for path in (ROOT / "xplanes" / "tools" / "web").iterdir()}
+    assert page
+    assert page | {Path("xplanes", "conf", "train.yaml")} <= shipped

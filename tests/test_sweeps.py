@@ -96,14 +96,10 @@ def test_published_resolutions_and_lrms_are_those_that_are_swept():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(), (SMALL,)], ids=str)
-def test_every_choice_of_every_sweep_exists(size):
-    groups = ("model", "lrm", "recipe", "model/sampler")
-    options = {group: set(group_options(group)) for group in groups}
+def test_every_sweep_has_its_tables_and_few_steps_on_small_scenes(size):
     for name in PAPER if size else SWEEPS:
         config = multirun(f"sweep={name}", *size)
         found = jobs_of(f"sweep={name}", *size)
-        for group in groups:
-            assert set(values_of(found, group)) <= options[group], (name, group)
         check_published(list(config.hydra.callbacks.table.published))
         check_what(config.hydra.callbacks.table.sheet)
         assert "params" in config.hydra.sweeper, name
@@ -131,7 +127,8 @@ def test_a_sweep_is_narrowed_down_on_the_command_line():
 
 
 def cases() -> Iterator[tuple[str, ...]]:
-    """Jobs of all sweeps that differ in more than numbers and scenes."""
+    """Jobs of all sweeps that differ in more than numbers and scenes, and kinds that have none."""
+    yield from (("model=nine_planes", "model/sampler=proposal"), ("model=gaussians_deform",))
     for name, size in itertools.product(SWEEPS, ((), (SMALL,))):
         if size and name not in PAPER:
             continue
@@ -153,6 +150,9 @@ def test_all_jobs_build_and_do_a_step():
         module, batches = built(experiment.config, scene)
         rays, state = batches.draw(0), module.state
         rendering = module.sampler.render(module.field, rays, state)
+        assert rendering.colour.shape == rays["target"].shape, overrides
+        assert len(rendering.colour) == (module.ray_settings.most_rays or 16 * 16), overrides
+        assert rendering.colour.isfinite().all(), overrides
         loss = sum(loss_terms(module.parts, module.method.losses, rendering, rays, state).values())
         assert torch.isfinite(loss), overrides
         loss.backward()
@@ -172,7 +172,6 @@ def test_fair_means_equal_rays_samples_and_terms():
         weights = plain["model"].get("loss", {})
         losses.add((weights.get("opacity", 0.0), weights.get("floaters", 0.0)))
         assert experiment.method.losses == {}
-        assert experiment.trainer["max_steps"] == 30000
     assert len(rays) == len(samplers) == 1
     assert losses == {(0.0, 0.0)}
 
@@ -274,10 +273,10 @@ def test_former_names_are_answered_with_those_of_today(former, now):
     assert prepare(now.split()) == now.split()
 
 
-def test_what_former_sweeps_are_now_exists():
-    for name, now in FORMER.items():
-        assert jobs_of(*shlex.split(now)), name
-        assert name not in SWEEPS
+@pytest.mark.parametrize("name", FORMER)
+def test_what_former_sweeps_are_now_exists(name):
+    assert jobs_of(*shlex.split(FORMER[name]))
+    assert name not in SWEEPS
 
 
 def test_a_run_that_began_with_former_names_says_so(tmp_path):

@@ -7,10 +7,9 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from tests.captures import NerfiesFolder, save, write_rows
+from tests.captures import NerfiesFolder, save, write_rows, write_transforms
 from tests.scenes.test_formats_agree import (
     CAMERAS,
     FOCAL,
@@ -38,16 +37,6 @@ def commands(program: str) -> list[list[str]]:
     return [shlex.split(line) for line in lines]
 
 
-def write_transforms(folder: Path, names: list[str], poses: np.ndarray) -> None:
-    """nerfstudio's transforms.json."""
-    frames = [
-        {"file_path": name, "transform_matrix": pose.tolist(), "time": index / 30}
-        for index, (name, pose) in enumerate(zip(names, poses, strict=True))
-    ]
-    content = {"fl_x": FOCAL, "w": SIZE, "h": SIZE, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(content))
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the page's reader works: a small capture of four cameras in every format."""
@@ -68,10 +57,12 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     firsts = POSES[::FRAMES]
     for folder, poses in (("kitchen", firsts), ("fern", POSES)):
         write_rows(captures / folder, poses, SIZE, SIZE, FOCAL)
+    lens = {"fl_x": FOCAL, "w": SIZE, "h": SIZE}
     names = [f"cam{camera}/0000.png" for camera in range(CAMERAS)]
-    write_transforms(captures / "fly", names, firsts)
+    write_transforms(captures / "fly", names, firsts, [k / 30 for k in range(CAMERAS)], **lens)
     names = [f"images/image{50 + index:06d}.jpg" for index in range(len(NAMES))]
-    write_transforms(captures / "hand", names, POSES)
+    times = [index / 30 for index in range(len(NAMES))]
+    write_transforms(captures / "hand", names, POSES, times, **lens)
     for index, name in enumerate(names):
         save(captures / "hand" / name, before_noise(index))
     return root

@@ -121,11 +121,6 @@ def assert_complete(root, views=VIEWS):
         assert shown == f"{scene}/val/r_001.png" * COPIES
 
 
-def change(server, **attributes):
-    for name, value in attributes.items():
-        setattr(server, name, value)
-
-
 def scenes_in(root):
     return sorted(path.name for path in root.iterdir() if path.is_dir())
 
@@ -175,9 +170,8 @@ def test_a_folder_in_the_way_is_not_touched(tmp_path, server):
     ids=["sound", "no ranges", "no version", "weak version", "no length", "other views"],
 )
 def test_a_cut_is_made_up_for_whatever_the_server_can_do(tmp_path, server, changes, asked):
-    server.limits = [50_000]
-    change(server, **changes)
-    lines = download(tmp_path, server)
+    with patch.multiple(server, **{"limits": [50_000]} | changes):
+        lines = download(tmp_path, server)
     assert_complete(tmp_path)
     ranges = [request.get("Range") for request in server.requests]
     assert ranges == [None, asked][: len(ranges)]
@@ -262,11 +256,11 @@ REFUSED = [
 
 @pytest.mark.parametrize(("changes", "words"), REFUSED, ids=[words[0] for _, words in REFUSED])
 def test_what_cannot_be_used_leaves_nothing_and_is_said(tmp_path, server, changes, words):
-    change(server, **changes)
     root = tmp_path / "root"
-    message = error(root, server)
-    for text in words:
-        assert text.format(url=server.url, root=root) in message
+    with patch.multiple(server, **changes):
+        message = error(root, server)
+        for text in words:
+            assert text.format(url=server.url, root=root) in message
     assert list(root.iterdir()) == []
     assert list(tmp_path.iterdir()) == [root]
     assert len(server.requests) == ("url" not in changes)

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -239,15 +240,10 @@ def test_floaters_are_told_by_the_images_nearest_in_time():
 
 
 def test_drawing_ends_once_it_is_not_wanted():
-    calls = []
-
-    def stop() -> bool:
-        calls.append(1)
-        return len(calls) == 3
-
+    stop = Mock(side_effect=[False, False, True])
     more: Any = {"views": views_of(), "frame": FLAT, "background": torch.ones(3), "at_once": 100}
     assert draw(Balls(FRONT), grid_renderer(), shot(), stop=stop, **more) is None
-    assert len(calls) == 3
+    assert stop.call_count == 3
 
 
 @pytest.mark.parametrize("lens", [False, True])

@@ -13,21 +13,15 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from tests.baselines.test_kplanes_field import products
-from tests.baselines.test_tensor4d_field import surface as tensor4d
 from tests.baselines.test_tineuvox_field import BOX
-from tests.tools.test_drawing import FRAME
-from xplanes.baselines.kplanes.field import HybridDecoder, KPlanes
-from xplanes.baselines.tensor4d.neus import NeusRenderer
-from xplanes.baselines.tineuvox.field import TiNeuVox
-from xplanes.baselines.tineuvox.fixed_step import FixedStepRenderer
+from tests.tools.test_drawing import FLAT, FRAME, every_renderer
+from tests.warm import ROOT
 from xplanes.cli import main
 from xplanes.errors import ConfigError
 from xplanes.fields import Decoder, XPlanes
 from xplanes.fields.background import Background
 from xplanes.fields.base import ViewDependentField
 from xplanes.fields.xplanes import FINE_PLANES, random_planes
-from xplanes.optional import MissingExtraError
 from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.behind import background_colour
 from xplanes.rendering.grid_renderer import GridRenderer
@@ -45,8 +39,10 @@ from xplanes.training.scores import score_view
 trimesh: Any = pytest.importorskip("trimesh")
 pytest.importorskip("skimage")
 
-ROOT = Path(__file__).resolve().parents[2]
 SIZE = 40
+
+
+WHOLE = GridRenderer(OccupancyGrid(16, 2, step=0.02), 192)
 
 
 class Ball(ViewDependentField):
@@ -76,10 +72,6 @@ class Ball(ViewDependentField):
         return 0.5 + 0.2 * features - 0.2 * directions
 
 
-def whole_grid() -> OccupancyGrid:
-    return OccupancyGrid(16, 2, step=0.02)
-
-
 def set_up(
     tmp_path: Path, field: Any, renderer: RayRenderer | None = None, frame: Frame = FRAME
 ) -> TrainedRun:
@@ -87,7 +79,7 @@ def set_up(
     poses = orbit(6, radius=3 / frame.scale, elevation=20, target=frame.centre)
     images = torch.zeros(6, SIZE, SIZE, 4, dtype=torch.uint8)
     views = Views(images, poses, torch.zeros(6), 1.2 * SIZE, tuple("abcdef"))  # type: ignore[arg-type]
-    parts = SimpleNamespace(field=field, renderer=renderer or GridRenderer(whole_grid(), 192))
+    parts = SimpleNamespace(field=field, renderer=renderer or WHOLE)
     method = SimpleNamespace(method=SimpleNamespace(model=SimpleNamespace(name="some model")))
     scene = SimpleNamespace(splits={"train": views}, background=torch.ones(3))
     content: Any = (tmp_path / "run", method, scene, "train", frame, parts, "last", 7)
@@ -180,7 +172,7 @@ def test_a_point_cloud_lies_on_the_surface(tmp_path):
 
 
 def test_what_lies_in_empty_cells_is_left_out_and_not_asked_for(tmp_path):
-    grid = whole_grid()
+    grid = OccupancyGrid(16, 2, step=0.02)
     allowed = torch.ones(2, 16, 16, 16, dtype=torch.bool)
     allowed[:, :, :, 9:] = False  # x
     grid.allow(allowed)
@@ -199,26 +191,16 @@ def test_what_lies_in_empty_cells_is_left_out_and_not_asked_for(tmp_path):
     assert mesh.is_watertight
 
 
-def dense(tmp_path: Path, name: str) -> TrainedRun:
-    """An untrained field of a model whose density varies in its cube."""
-    torch.manual_seed(0)
-    flat = Frame(1.0, torch.eye(3), torch.zeros(3))
-    if name == "K-Planes":
-        field = KPlanes(products(), HybridDecoder(4, 16))
-        return set_up(tmp_path, field, frame=flat)
-    field = TiNeuVox(BOX, 8, 4, 16, alpha=0.9)
-    torch.nn.init.normal_(field.grid, std=3)
-    renderer = FixedStepRenderer(field, near=1, far=5, step=0.5, threshold=1e-4)
-    return set_up(tmp_path, field, renderer, flat)
-
-
-@pytest.mark.parametrize("name", ["K-Planes", "TiNeuVox"])
+@pytest.mark.parametrize("name", ["occupancy", "fixed step"])
 def test_the_threshold_is_the_density_of_the_surface(tmp_path, name):
-    trained, resolution = dense(tmp_path, name), 48
+    field, renderer = every_renderer()[name]
+    if name == "fixed step":
+        torch.nn.init.normal_(field.grid, std=3)
+    trained, resolution = set_up(tmp_path, field, renderer, FLAT), 48
     volume, _ = module.solidity(trained, 0.5, resolution)
     threshold = float(-torch.log1p(-volume[volume > 0]).median()) * resolution / 2
     _, points = exported(trained, resolution=resolution, threshold=threshold)
-    low, high = BOX if name == "TiNeuVox" else torch.tensor([[-1.0] * 3, [1.0] * 3])
+    low, high = BOX if name == "fixed step" else torch.tensor([[-1.0] * 3, [1.0] * 3])
     points = points[((points > low + 0.05) & (points < high - 0.05)).all(dim=1)]
     assert len(points) > 100
     with torch.no_grad():
@@ -227,9 +209,7 @@ def test_the_threshold_is_the_density_of_the_surface(tmp_path, name):
 
 
 def test_a_field_of_signed_distances_gives_its_own_surface(tmp_path):
-    torch.manual_seed(0)
-    field = tensor4d(width=64, filled=False)
-    renderer = NeusRenderer(field, samples=8, more=8, coarse_sharpness=64.0)
+    field, renderer = every_renderer()["neus"]
     trained = set_up(tmp_path, field, renderer)
     _, points = exported(trained, times="0.0")
     with torch.no_grad():
@@ -264,7 +244,8 @@ def x_planes(plane_set: str, *, fine: bool = False, **parts: Any) -> XPlanes:
 
 
 @pytest.mark.parametrize("plane_set", ["three", "six", "nine", "six, fine"])
-def test_the_documented_reader_gives_the_values_of_the_field(tmp_path, plane_set):
+def test_the_documented_reader_gives_the_values_of_the_field(tmp_path, monkeypatch, plane_set):
+    monkeypatch.setitem(sys.modules, "skimage.measure", None)  # Planes need no extra.
     options: dict[str, Any] = {"activation": "silu", "density": "exp", "density_scale": 3.0}
     options = {} if plane_set == "six" else options | {"colour_margin": 0.0}
     plane_set, _, fine = plane_set.partition(", ")
@@ -380,10 +361,3 @@ def test_exports_that_cannot_be_are_refused(tmp_path):
     out.write_text("in the way")
     with pytest.raises(ConfigError, match="is a file"):
         export(trained, ExportOptions(), out)
-
-
-def test_a_missing_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "skimage.measure", None)
-    with pytest.raises(MissingExtraError, match=r'-e "\.\[export\]"'):
-        ExportOptions().check()
-    ExportOptions(what="planes").check()

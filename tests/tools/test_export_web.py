@@ -5,7 +5,6 @@ import hashlib
 import importlib
 import json
 import re
-import sys
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,6 @@ from tests.tools.browser import browser, canvas_of, needs_browser, until
 from tests.tools.test_export import FRAME, Ball, set_up
 from xplanes.cli import main
 from xplanes.errors import ConfigError
-from xplanes.optional import MissingExtraError
 from xplanes.scenes.frame import Frame
 from xplanes.tools import export_web as module
 from xplanes.tools.export import ExportOptions, export
@@ -152,12 +150,6 @@ def test_a_field_without_a_density_shows_its_own_points(tmp_path):
     assert two["vertices"] == 2
     with pytest.raises(ConfigError, match="--threshold 3: this field has points of its own"):
         page_of(trained, tmp_path / "none", threshold=3.0)
-
-
-def test_without_the_extra_it_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(MissingExtraError, match="export"):
-        page_of(set_up(tmp_path, Ball()))
 
 
 def test_the_command_writes_a_page(trained_run, tmp_path, capsys):

@@ -16,6 +16,7 @@ import torch
 import yaml
 
 from tests.local_server import serving
+from tests.training.runs import metrics, status
 from xplanes.cli import main
 from xplanes.errors import ConfigError
 from xplanes.tools.hub import fetch, model_card, push
@@ -121,6 +122,10 @@ def test_a_run_comes_back_from_the_hub_as_it_was_pushed(hub, trained_run, tmp_pa
     assert re.match(r"uploading   \d+ files, [\d.]+ MB, to somebody/excavator", said)
     assert {"README.md", "config.yaml", "metrics.json", "checkpoints/last.ckpt"} <= set(held.files)
     assert not [name for name in held.files if name.endswith((".log", ".lock"))]
+    # What names the machine stays there.
+    mine, theirs = status(trained_run), json.loads(held.files["run.json"])
+    assert set(mine) - set(theirs) == {"directory", "process"}
+    assert theirs["versions"] == mine["versions"]
 
     options = {"outputs": tmp_path / "outputs", "endpoint": address}
     run = fetch("hf://somebody/excavator", **options)
@@ -144,15 +149,6 @@ def test_a_run_comes_back_from_the_hub_as_it_was_pushed(hub, trained_run, tmp_pa
     assert capsys.readouterr().out.splitlines()[-1].startswith("offline     ")
 
 
-def test_what_names_the_machine_stays_there(hub, trained_run):
-    address, held = hub
-    push(trained_run, "somebody/excavator", endpoint=address)
-    mine = json.loads((trained_run / "run.json").read_text())
-    theirs = json.loads(held.files["run.json"])
-    assert set(mine) - set(theirs) == {"directory", "process"}
-    assert theirs["versions"] == mine["versions"]
-
-
 def card_of(run: Path) -> tuple[dict[str, Any], str]:
     _, head, text = model_card(run, "somebody/excavator").split("---\n", 2)
     return yaml.safe_load(head), text
@@ -160,13 +156,13 @@ def card_of(run: Path) -> tuple[dict[str, Any], str]:
 
 def test_the_model_card_has_scores_command_and_licence(trained_run, tmp_path):
     head, text = card_of(trained_run)
-    metrics = json.loads((trained_run / "metrics.json").read_text())
+    scored = metrics(trained_run)
     assert head["library_name"] == "xplanes"
     assert "license" not in head
     (found,) = head["model-index"]
     scores = {m["type"]: m["value"] for m in found["results"][0]["metrics"]}
-    assert scores["psnr"] == round(metrics["test"]["psnr"], 4)
-    assert f"| psnr | {metrics['test']['psnr']:.4g} |" in text
+    assert scores["psnr"] == round(scored["test"]["psnr"], 4)
+    assert f"| psnr | {scored['test']['psnr']:.4g} |" in text
     assert "xplanes train seed=0" in text
     assert "hf://somebody/excavator" in text
     assert "random initialisation" in text
@@ -182,7 +178,7 @@ def test_the_model_card_has_scores_command_and_licence(trained_run, tmp_path):
     assert (head["license"], head["base_model"]) == ("cc-by-nc-4.0", "somebody/lrm")
     assert "licence CC-BY-NC-4.0" in text
     assert "bundled with X-Planes (MIT licence)" in card_with(name="tiny", bundled="tiny")[1]
-    assert metrics["lrm"] == {}
+    assert scored["lrm"] == {}
 
     # A sweep's own option cannot be repeated for one run.
     (run / "overrides.txt").write_text("sweep=table1\nmodel=six_planes\n")
@@ -203,7 +199,9 @@ def test_commands_read_a_run_of_the_hub(hub, trained_run, tmp_path, monkeypatch,
     arguments = ["--frames", "1", "--size", "16", "--time", "0", "--path", "fixed"]
     assert main(["render", "hf://somebody/excavator", *arguments, "--out", "a.png"]) == 0
     assert (tmp_path / "a.png").is_file()
-    assert "fetching    hf://somebody/excavator" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    for words in ("fetching    hf://somebody/excavator", "last.ckpt, step 40", "wrote a.png"):
+        assert words in printed, words
 
 
 def test_what_cannot_be_is_refused_in_words(hub, trained_run, tmp_path, monkeypatch):

@@ -5,8 +5,10 @@ import math
 import re
 import shlex
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,14 +16,17 @@ import torch
 from PIL import Image
 
 from tests.balls import ball_views, surrounding, swinging
+from tests.captures import save, write_transforms
 from tests.lens_oracle import direction, pixel
 from tests.refusals import assert_refused
+from tests.training.runs import changed, small_config
 from xplanes.cli import main
 from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.evaluation.findings import camera_findings
 from xplanes.models.base import ModelSettings
+from xplanes.run import run
 from xplanes.scenes.cameras import look_at
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.lenses import Lenses, LensModel
@@ -88,9 +93,10 @@ def ball(*, moving=True, **train):
     return Scene("ball", named)
 
 
-def at_once(scene):
+def within(seconds, scene):
+    """The scene, all of whose times lie between 0 and that one."""
     for views in scene.splits.values():
-        views.times.zero_()
+        views.times.mul_(seconds)
     return scene
 
 
@@ -100,6 +106,14 @@ def painted(paint):
     for views in scene.splits.values():
         paint(views.images)
     return scene
+
+
+def white(images, where):
+    """Pixels become opaque white; ``where`` says of their alpha which ones."""
+    images.masked_fill_(where(images[..., 3:]), 255)
+
+
+NOT_SHOWN = partial(white, where=lambda alpha: alpha == 0)
 
 
 def textured(images):
@@ -121,29 +135,28 @@ def rig(count=4):
     return surrounding(count, 4.0).repeat(COUNT // count, 1, 1)
 
 
-def bent(views, model, **coefficients):
-    """Views through lenses."""
-    row = torch.zeros(len(views), 12, dtype=torch.float64)
+def bent(model, **coefficients):
+    """The ball through lenses."""
+    scene, row = ball(), torch.zeros(12, dtype=torch.float64)
     for name, value in coefficients.items():
-        row[:, ["k1", "k2", "k3", "k4", "k5", "k6", "p1"].index(name)] = value
-    lenses = Lenses(torch.full((len(views),), int(model)), row, torch.zeros(len(views)))
-    return replace(views, intrinsics=replace(views.intrinsics, lenses=lenses))
+        row[["k1", "k2", "k3", "k4", "k5", "k6", "p1"].index(name)] = value
+    for split, views in scene.splits.items():
+        count = len(views)
+        lenses = Lenses(torch.full((count,), int(model)), row.repeat(count, 1), torch.zeros(count))
+        intrinsics = replace(views.intrinsics, lenses=lenses)
+        scene.splits[split] = replace(views, intrinsics=intrinsics)
+    return scene
 
 
 def fisheye():
-    scene = ball()
-    parts = {
-        split: bent(views, LensModel.FISHEYE, k1=0.05, k2=-0.01)
-        for split, views in scene.splits.items()
-    }
-    return replace(scene, splits=parts)
+    return bent(LensModel.FISHEYE, k1=0.05, k2=-0.01)
 
 
 IN_ORDER = {
     "moving camera": ball,
     "fixed cameras": lambda: ball(poses=rig()),
-    "one time": lambda: at_once(ball(moving=False)),
-    "fixed cameras, one time": lambda: at_once(ball(moving=False, poses=rig())),
+    "one time": lambda: within(0, ball(moving=False)),
+    "fixed cameras, one time": lambda: within(0, ball(moving=False, poses=rig())),
     "opaque": lambda: painted(textured),
     "fisheye": fisheye,
     "random times": lambda: ball(
@@ -164,13 +177,6 @@ def gap():
     scene = ball()
     halves = [torch.linspace(0, 0.25, 8), torch.linspace(0.75, 1, 8)]
     scene.splits["train"].times[:] = torch.cat(halves)
-    return scene
-
-
-def short():
-    scene = ball()
-    for views in scene.splits.values():
-        views.times.mul_(0.01)
     return scene
 
 
@@ -195,22 +201,6 @@ def sharing(*, files=(), cameras=(), images=()):
     for mine, theirs in images:
         test.images[mine] = train.images[theirs]
     return replace(scene, splits={"train": train, "test": replace(test, files=tuple(names))})
-
-
-def white(images):
-    images[images[..., 3] > 0] = 255
-
-
-def on_white(images):
-    images[images[..., 3] == 0] = 255
-
-
-def emptied(images):
-    images[::3] = 0
-
-
-def some_full(images):
-    textured(images[-1:])
 
 
 def hardly_masked(images):
@@ -244,9 +234,9 @@ def two_sizes():
 
 WRONG = {
     "a gap in the times": (gap, "times: .*between 0.25 and 0.75, 14 times"),
-    "times in other units": (short, "times: .*run from 0 to 0.01, 1% of"),
+    "times in other units": (lambda: within(0.01, ball()), "times: .*run from 0 to 0.01, 1% of"),
     "no times": (
-        lambda: at_once(ball(poses=rig())),
+        lambda: within(0, ball(poses=rig())),
         "one_time: .*train/000.png and train/004.png have one camera",
     ),
     "other axes": (turned, "axes: 16 of 16 cameras look away"),
@@ -266,10 +256,19 @@ WRONG = {
         lambda: sharing(images=[(1, 7), (3, 9)]),
         r"shared: .*2 of 4 .* pixels \(test/001.png is train/007",
     ),
-    "white on white": (lambda: painted(white), "white: .*100% of the silhouettes"),
-    "opaque white": (lambda: painted(on_white), "white: .*the images are opaque"),
-    "empty images": (lambda: painted(emptied), "empty: .*8 of 20 images show"),
-    "a mask is missing": (lambda: painted(some_full), "opaque: .*2 of 20 images"),
+    "white on white": (
+        lambda: painted(partial(white, where=lambda alpha: alpha > 0)),
+        "white: .*100% of the silhouettes",
+    ),
+    "opaque white": (lambda: painted(NOT_SHOWN), "white: .*the images are opaque"),
+    "empty images": (
+        lambda: painted(lambda images: images[::3].zero_()),
+        "empty: .*8 of 20 images show",
+    ),
+    "a mask is missing": (
+        lambda: painted(lambda images: textured(images[-1:])),
+        "opaque: .*2 of 20 images",
+    ),
     "useless masks": (lambda: painted(hardly_masked), "opaque: .*20 of 20 .* less tha"),
     "inverted masks": (lambda: painted(inverted), "inverted: .*of 20 images are opaqu"),
     "stray pixels": (
@@ -382,9 +381,8 @@ def test_what_the_reader_says_is_a_warning(tmp_path, capsys):
 
 
 def test_distortion_is_how_far_the_oracle_moves_a_corner():
-    views = ball().splits["train"]
     k = {"k1": -0.2, "k2": 0.03, "p1": 0.01}
-    lensed = bent(views, LensModel.PERSPECTIVE, **k)
+    lensed = bent(LensModel.PERSPECTIVE, **k).splits["train"]
     assert lens_words(lensed) == "perspective k1 k2 p1"
     focal, centre = [0.5 * SIZE / math.tan(0.35)] * 2, [SIZE / 2] * 2
     moved = []
@@ -397,9 +395,7 @@ def test_distortion_is_how_far_the_oracle_moves_a_corner():
 
 
 def test_points_give_opaque_scenes_their_cube_and_are_drawn(inspected):
-    bare = ball()
-    for views in bare.splits.values():
-        views.images[..., 3] = 255
+    bare = painted(lambda images: images[..., 3].fill_(255))
     generator = torch.Generator().manual_seed(0)
     near = 0.7 * (2 * torch.rand(300, 3, generator=generator) - 1)
     far = 50 + torch.rand(100, 3, generator=generator)
@@ -417,17 +413,11 @@ def test_points_give_opaque_scenes_their_cube_and_are_drawn(inspected):
 
 
 def write_nerfstudio(folder: Path, views: Views, **more):
-    (folder / "images").mkdir(parents=True)
-    focal = float(views.intrinsics.focal[0, 0])
-    frames = []
-    for index, pose in enumerate(views.camera_to_world.tolist()):
-        name = f"images/{index:03d}.png"
-        Image.fromarray(views.image(index).numpy()).save(folder / name)
-        frames.append(
-            {"file_path": name, "transform_matrix": pose, "time": float(views.times[index])}
-        )
-    content = {"fl_x": focal, "w": SIZE, "h": SIZE, "frames": frames, **more}
-    (folder / "transforms.json").write_text(json.dumps(content))
+    names = [f"images/{index:03d}.png" for index in range(len(views))]
+    for index, name in enumerate(names):
+        save(folder / name, views.image(index).numpy())
+    content = {"fl_x": float(views.intrinsics.focal[0, 0]), "w": SIZE, "h": SIZE, **more}
+    write_transforms(folder, names, views.camera_to_world, views.times.tolist(), **content)
 
 
 def test_a_folder_is_recognised_read_and_drawn(tmp_path, monkeypatch, capsys):
@@ -473,7 +463,7 @@ def test_errors_are_one_line_and_leave_1(tmp_path, monkeypatch, capsys):
     for name in ("packed/renders.zip", "rig/transforms_a.json", "trained/run.json"):
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).touch()
-    cases = [
+    for arguments, words in (
         (["missing"], "missing is not a folder"),
         (["."], r"not a scene of a known format. Scenes inside it: away, ball"),
         (["rig"], r"Join the frames of transforms_a\.json in a transforms\.json\. What"),
@@ -486,8 +476,7 @@ def test_errors_are_one_line_and_leave_1(tmp_path, monkeypatch, capsys):
         (["ball", "data.views=64"], "data.views=64"),
         (["ball", "data=blender"], "transforms_train"),
         (["away"], "negate the second and third column"),
-    ]
-    for arguments, words in cases:
+    ):
         assert main(["inspect", *arguments]) == 1, arguments
         error = capsys.readouterr().err
         assert re.search(words, error), (arguments, error)
@@ -515,23 +504,14 @@ def test_a_format_of_ones_own_joins(tmp_path, monkeypatch):
 
 
 def test_a_run_says_what_cameras_and_times_tell(tmp_path, caplog, monkeypatch):
-    from tests.training.runs import small_config
-    from xplanes import run
-
-    views = painted(on_white).splits["train"]
+    views = painted(NOT_SHOWN).splits["train"]
     views.times[:] = gap().splits["train"].times
     write_nerfstudio(tmp_path / "ball", views)
-    config = small_config(tmp_path)
-    config["data"] = compose_plain(
-        "train", ["data=nerfstudio", f"data.root={tmp_path}", "data.scene=ball"]
-    )["data"] | {"resolution": None}
-
-    def stop(*_: object) -> None:
-        raise SceneError("far enough")
-
-    monkeypatch.setattr(run, "initialisation_of", stop)
+    chosen = ("data=nerfstudio", f"data.root={tmp_path}", "data.scene=ball", "data.resolution=null")
+    config = small_config(tmp_path) | {"data": changed((), *chosen)["data"]}
+    monkeypatch.setattr("xplanes.run.initialisation_of", Mock(side_effect=SceneError("far enough")))
     with pytest.raises(SceneError, match="far enough"):
-        run.run(config, tmp_path / "run", [], resume=False)
+        run(config, tmp_path / "run", [], resume=False)
     said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     for words in (
         "no training view shows the times between 0.25 and 0.75",

@@ -1,27 +1,34 @@
-"""Rendered videos: camera paths, times and output files."""
+"""Rendered videos: cameras, also those of files, times and output files."""
 
-import sys
+import json
+import math
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageSequence
 
-from xplanes.errors import ConfigError
+from tests.refusals import assert_refused
+from xplanes.errors import ConfigError, SceneError
 from xplanes.evaluation.render import training_path, write_video
-from xplanes.optional import MissingExtraError
 from xplanes.rendering.pictures import to_bytes
+from xplanes.scenes.cameras import PosedCamera
+from xplanes.scenes.views import Views
+from xplanes.tools.camera_path import read_camera_path
 from xplanes.tools.render import VideoOptions, cameras, find_view, render_video, times
-from xplanes.tools.runs import TrainedRun, load_run
+from xplanes.tools.runs import TrainedRun
 from xplanes.training.scores import score_view
 
 
 @pytest.fixture(scope="module")
-def trained(trained_run: Path) -> TrainedRun:
-    return load_run(trained_run)
+def views(trained: TrainedRun) -> Views:
+    return trained.scene.splits["train"]
 
 
 def test_ways_through_time():
@@ -116,12 +123,6 @@ def test_an_mp4_keeps_its_frames(tmp_path):
     assert [float(frame.mean()) for frame in read] == pytest.approx([20, 120, 220], abs=4)
 
 
-def test_an_mp4_without_the_extra_names_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(MissingExtraError, match=r'-e "\.\[video\]"'):
-        VideoOptions(out="video.mp4").check()
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -146,43 +147,38 @@ def test_options_that_cannot_be_are_refused(options, words):
         VideoOptions(**options).check()
 
 
-def test_a_video_stays_with_the_camera_of_a_rig(trained):
-    views = trained.scene.splits["train"]
-    poses = views.camera_to_world[[0, 1, 1, 1, 1, 0]]
-    rig = replace(views.subset(range(6)), camera_to_world=poses, times=torch.arange(6) / 5)
-    indices, seen_at = training_path(rig, 5)
-    assert indices == [1] * 5
-    assert seen_at.tolist() == [0, 0.25, 0.5, 0.75, 1]
+def seen(views: Views, places: Sequence[int], times: Sequence[float]) -> Views:
+    """Views by one camera, from places of these views, at times."""
+    poses = views.camera_to_world[[*places]]
+    return replace(
+        views.subset(range(len(times))), camera_to_world=poses, times=torch.tensor(times)
+    )
 
 
-def moving(views, times):
-    """Views from as many places as there are times, all by one camera."""
-    return replace(views.subset(range(len(times))), times=torch.tensor(times))
+@pytest.mark.parametrize(
+    ("places", "times", "expected"),
+    [
+        ([0, 1, 1, 1, 1, 0], [0, 0.2, 0.4, 0.6, 0.8, 1], [1] * 5),  # A rig: it stays with a camera.
+        (range(5), [0.5, 0.0, 1.0, 0.25, 0.75], [1, 3, 0, 4, 2]),
+        (range(5), [0.5, 0.0, 1.0, 0.25, 0.75], [1, 0, 2]),
+        (range(6), [0.0] * 6, [0, 1, 2, 2, 3, 4, 5]),
+        # A camera that stands still at first is no rig.
+        ([0, 0, 0, 1, 2, 3, 4, 5], [t / 7 for t in range(8)], [*range(8)]),
+    ],
+)
+def test_a_video_follows_its_camera_at_its_times(views, places, times, expected):
+    rig = seen(views, places, times)
+    indices, seen_at = training_path(rig, len(expected))
+    assert indices == expected
+    if any(times):
+        torch.testing.assert_close(seen_at, torch.linspace(0, 1, len(expected)))
 
 
-def test_a_video_follows_a_moving_camera_at_its_times(trained):
-    views = trained.scene.splits["train"]
-    seen = moving(views, [0.5, 0.0, 1.0, 0.25, 0.75])
-    indices, seen_at = training_path(seen, 5)
-    assert indices == [1, 3, 0, 4, 2]
-    assert seen_at.tolist() == [0, 0.25, 0.5, 0.75, 1]
-    assert training_path(seen, 3)[0] == [1, 0, 2]
-    still = moving(views, [0.0] * 6)
-    assert training_path(still, 7)[0] == [0, 1, 2, 2, 3, 4, 5]
-    # A camera that stands still at first is no rig.
-    poses = views.camera_to_world[[0, 0, 0, 1, 2, 3, 4, 5]]
-    paused = replace(moving(views, [t / 7 for t in range(8)]), camera_to_world=poses)
-    assert training_path(paused, 8)[0] == list(range(8))
-
-
-def test_a_video_does_not_jump_between_cameras(trained):
-    views = trained.scene.splits["train"]
-    near, far = (views.camera_to_world[0].clone() for _ in range(2))
-    far[0, 3] += 3
-    poses = torch.stack([near, far] * 4)
-    poses[:, 1, 3] += torch.arange(8) / 10
+def test_a_video_does_not_jump_between_cameras(views):
     # Two views of each timestep: from each the one beside the last.
-    pairs = replace(moving(views, [0.0, 0.0, 0.3, 0.3, 0.6, 0.6, 1.0, 1.0]), camera_to_world=poses)
+    pairs = seen(views, [0] * 8, [0.0, 0.0, 0.3, 0.3, 0.6, 0.6, 1.0, 1.0])
+    pairs.camera_to_world[1::2, 0, 3] += 3
+    pairs.camera_to_world[:, 1, 3] += torch.arange(8) / 10
     assert training_path(pairs, 4)[0] == [0, 2, 4, 6]
     # In turn: the camera with most views, which its focal length tells.
     focal = pairs.intrinsics.focal * torch.tensor([1, 1.1, 1, 1.1, 1, 1.1, 1.1, 1.1])[:, None]
@@ -201,10 +197,9 @@ def test_a_video_of_surroundings_stays_with_the_cameras_by_default(trained):
     assert chosen == ["orbit", "cameras", "orbit", "orbit", "fixed", "fixed"]
 
 
-def test_cameras_of_the_training_views_are_a_path(trained):
+def test_cameras_of_the_training_views_are_a_path(trained, views):
     options = VideoOptions("cameras", frames=3, size=20)
     found = cameras(options, trained.scene.splits, trained.frame)
-    views = trained.scene.splits["train"]
     indices, _ = training_path(views, 3)
     for camera, index in zip(found, indices, strict=True):
         own = views.camera(index)
@@ -217,3 +212,112 @@ def test_cameras_of_the_training_views_are_a_path(trained):
     assert path.name == "render_cameras_own.webp"
     with Image.open(path) as video:
         assert (video.n_frames, video.size) == (3, (20, 20))  # type: ignore[attr-defined]
+
+
+# Camera paths from files
+
+
+def write(path: Path, content: Any) -> Path:
+    path.write_text(json.dumps(content), encoding="utf-8")
+    return path
+
+
+SHOTS = ((40.0, 0.75), (55.0, 0.25))
+"""Fields of view and times of two frames."""
+
+
+def nerfstudio(views: Views, **changed: Any) -> dict[str, Any]:
+    """Two cameras of training views, with different fields of view."""
+    poses = views.camera_to_world[:2].flatten(1).tolist()
+    return {
+        "camera_type": "perspective",
+        "render_height": 12,
+        "render_width": 20,
+        "seconds": 0.5,
+        "keyframes": [],
+        "camera_path": [
+            {"camera_to_world": pose, "fov": fov, "aspect": 20 / 12, "render_time": time}
+            for pose, (fov, time) in zip(poses, SHOTS, strict=True)
+        ],
+        **changed,
+    }
+
+
+def transforms(views: Views, **changed: Any) -> dict[str, Any]:
+    frames = [{"transform_matrix": pose.tolist()} for pose in views.camera_to_world[:3]]
+    return {"camera_angle_x": 0.8, "w": 16, "h": 10, "frames": frames, **changed}
+
+
+def test_a_frame_is_the_render_from_its_camera_at_its_time(trained, views, tmp_path):
+    path = write(tmp_path / "camera_path.json", nerfstudio(views))
+    folder = render_video(trained, VideoOptions(str(path), out=f"{tmp_path}/frames/"))
+    for index, (fov, time) in enumerate(SHOTS):
+        focal = 6 / math.tan(math.radians(fov / 2))
+        rays = PosedCamera(views.camera_to_world[index], focal, 12, 20).rays()
+        image = trained.module.renderer.image(
+            trained.module.field, *trained.frame.rays(*rays), time, trained.scene.background
+        )
+        expected = to_bytes(image["colour"].view(12, 20, 3)).numpy().astype(int)
+        found = np.asarray(Image.open(folder / f"frame_{index:04d}.png")).astype(int)
+        assert np.abs(found - expected).max() <= 1
+        assert np.ptp(expected) > 30
+
+
+def test_a_transforms_file_is_a_path(views, tmp_path):
+    path = read_camera_path(write(tmp_path / "a.json", transforms(views, fps=7)))
+    assert torch.equal(path.poses, views.camera_to_world[:3])
+    assert path.times.tolist() == [0, 0.5, 1]
+    assert (path.height, path.width, path.fps) == (10, 16, 7)
+    assert path.focal(10, 16).tolist() == pytest.approx([8 / math.tan(0.4)] * 3)
+
+
+def test_sizes_rates_and_times_can_be_set(views, tmp_path):
+    path = str(write(tmp_path / "a.json", nerfstudio(views)))
+    written, changed = VideoOptions(path=path), VideoOptions(path=path, size=10, fps=9, time="0.5")
+    assert (written.shape({"train": views}), written.rate) == ((12, 20), 4)
+    assert (changed.shape({"train": views}), changed.rate) == ((6, 10), 9)
+    assert written.times({"train": views}).tolist() == [0.75, 0.25]
+    assert changed.times({"train": views}).tolist() == [0.5, 0.5]
+
+
+def test_times_of_a_spline_that_overshoots_stay_in_range(views, tmp_path, caplog):
+    content = nerfstudio(views)
+    for entry, time in zip(content["camera_path"], (-0.03, 1.08), strict=True):
+        entry["render_time"] = time
+    assert read_camera_path(write(tmp_path / "a.json", content)).times.tolist() == [0, 1]
+    assert "2 of 2 times lie a little below 0 or above 1" in caplog.text
+
+
+def test_damaged_paths_are_refused(views, tmp_path):
+    path, usual = tmp_path / "a.json", nerfstudio(views)
+
+    def entry(**changed: Any) -> dict[str, Any]:
+        first, second = usual["camera_path"]
+        return {**usual, "camera_path": [first, {**second, **changed}]}
+
+    for content, words in (
+        ([], "must hold a JSON object"),
+        ({}, 'Its key "camera_path"'),
+        ({**usual, "camera_path": []}, "holds no cameras"),
+        ({**usual, "camera_path": [3]}, r"camera_path\[0\] is 3"),
+        ({**usual, "camera_type": "fisheye"}, "camera_type is 'fisheye'"),
+        ({**usual, "render_width": 0}, "render_width is 0"),
+        (entry(fov=180), r"camera_path\[1\]: fov is 180"),
+        (entry(render_time=None), r"camera_path\[1\]: render_time is None"),
+        (entry(render_time=1.5), r"camera_path\[1\]: render_time is 1.5"),
+        (entry(camera_to_world=[1.0] * 11), r"camera_path\[1\]: camera_to_world must be"),
+        (transforms(views, camera_angle_x=None), "camera_angle_x is None"),
+    ):
+        assert_refused(SceneError, words, partial(read_camera_path, write(path, content)), content)
+    path.unlink()
+    assert_refused(SceneError, "no such camera path", VideoOptions(path=str(path)).check, "no file")
+
+
+def test_options_that_contradict_the_path_are_refused(views, tmp_path):
+    path = str(write(tmp_path / "a.json", nerfstudio(views)))
+    with pytest.raises(ConfigError, match=r"--frames 5.*2 cameras"):
+        VideoOptions(path=path, frames=5).check()
+    wide = str(write(tmp_path / "b.json", nerfstudio(views, render_width=10_000)))
+    with pytest.raises(ConfigError, match="10000 px"):
+        VideoOptions(path=wide).check()
+    VideoOptions(path=wide, size=64).check()

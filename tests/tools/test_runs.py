@@ -1,7 +1,8 @@
-"""Finding and loading run directories, and saying what is wrong with them."""
+"""Run directories are found, loaded and scored, or it is said what is wrong with them."""
 
 import json
 import shutil
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,10 @@ import torch
 import yaml
 
 from tests.refusals import assert_refused
+from tests.training.runs import metrics
 from xplanes.errors import ConfigError
 from xplanes.scenes.datamodule import SceneDataModule
+from xplanes.tools.evaluate import UnavailableError, evaluate, lpips, score_table, write_scores
 from xplanes.tools.runs import find_run, load_run
 
 
@@ -21,42 +24,24 @@ def copied(trained_run: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(trained_run, tmp_path / "run"))
 
 
-def made(*folders: Path) -> None:
-    for folder in folders:
-        folder.mkdir(parents=True)
-        (folder / "run.json").write_text("{}")
-
-
-def refusal(run: Path, outputs: Path) -> str:
-    return assert_refused(ConfigError, "", partial(find_run, run, outputs), run)
-
-
-def test_a_misspelt_run_lists_similar_names(tmp_path):
-    near = tmp_path / "outputs" / "2026-01-02_lego_six_planes_s0"
-    made(near, tmp_path / "outputs" / "zzz")
-    text = refusal(tmp_path / "outputs" / "2026-01-02_lego_six_plane_s0", tmp_path / "outputs")
-    assert "does not exist. Similar names:" in text
-    assert str(near) in text
-    assert "zzz" not in text
-
-
-def test_an_unknown_run_lists_the_newest(tmp_path):
-    made(run := tmp_path / "outputs" / "sweeps" / "planes" / "0_lego")
-    text = refusal(Path("qqq"), tmp_path / "outputs")
-    assert "The newest runs:" in text
-    assert str(run) in text
-
-
-def test_a_sweep_is_told_from_a_run(tmp_path):
-    made(tmp_path / "sweep" / "0_a", tmp_path / "sweep" / "1_b")
-    text = refusal(tmp_path / "sweep", tmp_path)
-    assert "folder of 2 runs; name one of them" in text
-    assert "0_a" in text
-
-
-def test_no_runs_at_all_says_how_to_make_one(tmp_path):
-    said = refusal(tmp_path / "x", tmp_path / "outputs")
-    assert said.endswith(("python train.py", "xplanes train")), said
+@pytest.mark.parametrize(
+    ("runs", "wanted", "words"),
+    [
+        ("outputs/six outputs/z", "outputs/sx", r"does not exist\. Similar names:\s+outputs/six$"),
+        ("elsewhere/six", "elsewhere/sx", r"Similar names:\s+elsewhere/six$"),
+        ("outputs/sweeps/planes/0_a", "qqq", r"The newest runs:\s+outputs/sweeps/planes/0_a$"),
+        ("sweep/0_a sweep/1_b", "sweep", r"folder of 2 runs; name one of them:\s+sweep/0_a"),
+        ("", "x", r"(python train\.py|xplanes train)$"),
+    ],
+    ids=["misspelt", "misspelt elsewhere", "unknown", "a sweep", "no runs at all"],
+)
+def test_what_is_no_run_is_answered_with_what_is_there(tmp_path, monkeypatch, runs, wanted, words):
+    monkeypatch.chdir(tmp_path)
+    for name in map(Path, runs.split()):
+        name.mkdir(parents=True)
+        (name / "run.json").write_text("{}")
+    with pytest.raises(ConfigError, match=words):
+        find_run(Path(wanted))
 
 
 def test_what_is_loaded_is_announced_first(trained_run):
@@ -128,3 +113,61 @@ def test_a_relative_data_folder_is_found_from_elsewhere(copied, monkeypatch, tmp
     monkeypatch.chdir(tmp_path)
     assert load_run(copied).experiment.data.root == str(root)
     assert not (tmp_path / root.name).exists()
+
+
+# Scores after training are the scores of training
+
+
+def test_scores_equal_those_of_the_run(trained_run):
+    known = metrics(trained_run)
+    scores = evaluate(load_run(trained_run), "none")
+    assert (scores["step"], scores["split"]) == (known["step"], known["split"])
+    assert scores["test"] == pytest.approx(known["test"], abs=1e-6)
+    for mine, theirs in zip(scores["views"], known["views"], strict=True):
+        assert mine.pop("file") == theirs.pop("file")
+        assert mine == pytest.approx(theirs, abs=1e-6)
+
+
+def test_each_split_and_checkpoint_has_its_own_file(trained_run):
+    before = (trained_run / "metrics.json").read_bytes()
+    names = []
+    for checkpoint, split in (("last", "val"), ("best", "val"), ("last", "train")):
+        scores = evaluate(load_run(trained_run, checkpoint=checkpoint, split=split), "none")
+        assert scores["views"][0]["file"].startswith(f"{split}/")
+        path = write_scores(trained_run, scores)
+        assert json.loads(path.read_text())["test"] == scores["test"]
+        names.append(path.name)
+    assert names == ["evaluation_val.json", "evaluation_val_best.json", "evaluation_train.json"]
+    assert (trained_run / "metrics.json").read_bytes() == before
+
+
+def test_lpips_that_is_not_installed_is_a_reason_not_a_failure(trained_run, monkeypatch):
+    for name in ("torchvision", "torchvision.models"):
+        monkeypatch.setitem(sys.modules, name, None)
+    scores = evaluate(load_run(trained_run), "alex")
+    assert set(scores["test"]) == {"psnr", "ssim", "floaters"}
+    assert ".[lpips]" in scores["not_computed"]["lpips_alex"]
+    assert "lpips_alex not computed (torchvision is not installed" in score_table(scores)
+
+
+def test_lpips_names_what_is_too_small():
+    with pytest.raises(UnavailableError, match="16 pixels"):
+        lpips("vgg", 16, "cpu", download=False)
+
+
+def test_table_has_a_line_per_view_and_the_means():
+    scores = {
+        "test": {"psnr": 20.5, "ssim": 0.75, "lpips_vgg": 0.2},
+        "views": [
+            {"file": "test/a.png", "time": 0.0, "psnr": 20.0, "ssim": 0.5, "lpips_vgg": 0.3},
+            {"file": "test/b.png", "time": 1.0, "psnr": 21.0, "ssim": 1.0, "lpips_vgg": 0.1},
+        ],
+        "not_computed": {},
+    }
+    lines = [line.split() for line in score_table(scores).splitlines()]
+    assert lines == [
+        ["view", "time", "psnr", "ssim", "lpips_vgg"],
+        ["test/a.png", "0.000", "20.00", "0.5000", "0.3000"],
+        ["test/b.png", "1.000", "21.00", "1.0000", "0.1000"],
+        ["mean", "of", "2", "views", "20.50", "0.7500", "0.2000"],
+    ]

@@ -1,5 +1,6 @@
 """Images in, triplanes and a turntable video out."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,17 +12,11 @@ from tests.preparation.test_encode import frames_of, model_of
 from tests.preparation.test_reconstruct import publish
 from xplanes.cli import main
 from xplanes.config import compose_plain
-from xplanes.errors import ConfigError, SceneError
 from xplanes.experiment import Experiment
-from xplanes.lrm import LRMError
 from xplanes.preparation import load_triplanes
 from xplanes.preparation.encode import straight_alpha
 from xplanes.tools import turntable as module
-from xplanes.tools.turntable import find_pictures, turntable, write_triplanes
-
-
-def settings(*overrides: str) -> Experiment:
-    return Experiment.read(compose_plain("train", overrides))
+from xplanes.tools.turntable import turntable, write_triplanes
 
 
 @pytest.fixture
@@ -86,36 +81,30 @@ def test_the_video_begins_at_the_models_camera_and_completes_one_orbit(few):
         assert frame[:, 14:].mean() < 200
 
 
-def test_settings_that_make_no_triplanes_are_refused(tmp_path, pictures):
-    def make(*arguments, out="made.pt"):
-        write_triplanes([pictures], Path(out), settings(*arguments))
-
-    with pytest.raises(ConfigError, match=r"lrm=none does not encode images.*lrm=small"):
-        make("lrm=none")
-    with pytest.raises(ConfigError, match=r"out=made\.zip: must end in"):
-        make("lrm=small", out="made.zip")
-    with pytest.raises(ConfigError, match=r"Did you mean lrm\.weights"):
-        make("lrm=small", "lrm.weight=a")
-    with pytest.raises(LRMError, match=r"lrm\.weights=absent\.pt is not a file"):
-        make("lrm=small", "lrm.weights=absent.pt")
-
-
-def test_missing_images_are_named(tmp_path):
-    cases = (
-        ([tmp_path / "absent.png"], "absent"),
-        ([tmp_path], "contains no images"),
-        ([], "at least one"),
-    )
-    for paths, words in cases:
-        with pytest.raises(SceneError, match=words):
-            find_pictures(paths)
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("PICTURES lrm=none", "lrm=none does not encode images.*lrm=small"),
+        ("PICTURES lrm=small out=made.zip", r"out=made\.zip: must end in"),
+        ("PICTURES lrm=small lrm.weight=a", r"Did you mean lrm\.weights"),
+        ("PICTURES lrm=small lrm.weights=absent.pt", r"lrm\.weights=absent\.pt is not a file"),
+        ("absent.png lrm=tiny", r"absent\.png"),
+        (". lrm=tiny", "contains no images"),
+        ("lrm=tiny", "at least one"),
+    ],
+)
+def test_what_makes_no_triplanes_is_refused(given, words, tmp_path, pictures, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["triplanes", *given.replace("PICTURES", str(pictures)).split()]) == 1
+    assert re.search(words, capsys.readouterr().err)
 
 
 def test_opaque_images_cause_a_message(tmp_path, few, capsys):
     picture = tmp_path / "opaque.png"
     Image.fromarray(np.full((30, 30, 3), 90, np.uint8)).save(picture)
     weights = publish(tmp_path, "openlrm-1.1")
-    experiment = settings("lrm=small", f"lrm.weights={weights}", "preparation.cache=null")
+    given = ["lrm=small", f"lrm.weights={weights}", "preparation.cache=null"]
+    experiment = Experiment.read(compose_plain("train", given))
     write_triplanes([picture], tmp_path / "a.pt", experiment)
     assert "no transparency" in capsys.readouterr().out
     assert load_triplanes(tmp_path / "a.pt").triplanes.shape == (1, 3, 6, 8, 8)

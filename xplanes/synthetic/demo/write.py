@@ -331,6 +331,8 @@ class ProceduralSettings(SceneSettings, ABC):
             scene = read_scene(self, splits)
             return _with_masks(scene, folder / MASKS)
         except SceneError as problem:
+            if str(problem).startswith("data."):  # What is wrong is a setting, not the files.
+                raise
             raise SceneError(
                 f"{problem} This is a demo scene: delete {folder} to render it again"
             ) from problem

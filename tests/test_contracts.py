@@ -601,6 +601,24 @@ def test_imports_only_point_up_the_list():
                 assert target not in WINGS, f"{told}: that is a wing"
 
 
+@pytest.mark.slow
+def test_the_core_runs_without_its_wings():
+    core = {name.removesuffix(".__init__") for name in sources() if room(name) not in WINGS}
+    core -= {"train", "xplanes.__main__"}
+    if importlib.util.find_spec("triton") is None:
+        core -= {name for name in core if "_triton" in name}
+    script = (
+        f"import importlib, sys\nfor name in {sorted(core)}: importlib.import_module(name)\n"
+        "print(*sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    loaded = set(done.stdout.split())
+    assert core <= loaded
+    assert not {name for name in loaded if room(name) in WINGS and name.startswith("xplanes.")}
+
+
 def test_commands_of_a_wing_come_from_an_entry_point():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
     given = settings["xplanes.commands"].items()

@@ -8,6 +8,8 @@ import inspect
 import math
 import pkgutil
 import re
+import subprocess
+import sys
 import tomllib
 from dataclasses import fields
 from graphlib import TopologicalSorter

@@ -138,6 +138,23 @@ def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():
             assert float(found) == pytest.approx(weight * passed)
 
 
+def test_in_a_rig_light_stopped_at_the_border_passes_for_longer():
+    weights = "model.loss.passing=0.5", "model.loss.passing_steps=20"
+    module = built("world", *weights, "model.loss.rig_passing_steps=200")
+    twice = replace(module.site, times=module.site.times.repeat(2))
+    rig = module.model.settings.build(twice)
+    batch, rendering = rendered(module, "world")
+    border = float(rendering.border.detach())
+    assert border > 0
+    passed = float((1 - rendering.opacity.detach()).mean())
+    state = replace(module.state, step=100)
+    found = rig.losses(rendering, batch, state)["passing"].detach()
+    assert float(found) == pytest.approx(0.25 * (passed + border))
+    assert "passing" not in module.model.losses(rendering, batch, state)
+    assert rig.group_rate_factor("time", 100, 0.1) == 0
+    assert module.model.group_rate_factor("time", 100, 0.1) > 0
+
+
 def test_time_planes_wait_as_long_as_light_that_passes_the_cube_costs():
     world, white = built("world"), built("white")
     for module, step, waits in ((world, 150, True), (world, 200, False), (white, 150, False)):

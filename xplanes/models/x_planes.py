@@ -41,6 +41,9 @@ from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
 from xplanes.streams import Stream, TrainingState, initial_values, step_generator
 
+RIG_VIEWS = 2
+"""Views that show each timestep of a rig, on average."""
+
 MOST_SMOOTH = 10.0
 """Largest factor on total variation where few cameras look."""
 
@@ -119,6 +122,9 @@ class XPlanesLoss(Settings):
     # persists.
     passing: Weight
     passing_steps: Steps  # Steps over which `model.loss.passing` falls to 0.
+    # The same for rigs, where at least two views show each timestep on average. There, light that
+    # is stopped near a face of the cube counts as passing, as in `model.sampler.border`.
+    rig_passing_steps: Steps
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
     sparse_weight: Weight  # Weight of L_r (X-Planes, Eq. 17).
     sparse_reduction: Literal["mean", "sum"]  # Reduction of L_r over entries; the paper: sum.
@@ -289,8 +295,12 @@ class XPlanesModel(Model):
         self._field, self.settings, self.weights = field, settings, settings.loss
         self.fine_settings = None if field.fine is None else settings.fine
         self.total_variation = self.weights.total_variation
+        self._is_rig = site.moves and len(site.times) >= RIG_VIEWS * len(site.times.unique())
         if field.background is not None:
             self.weights = settings.loss.with_learnt_background()
+            if self._is_rig:
+                steps = self.weights.rig_passing_steps
+                self.weights = replace(self.weights, passing_steps=steps)
             if site.initialised:  # Its surfaces stop light already.
                 self.weights = replace(self.weights, passing=0.0)
         if field.background is not None and field.moves:
@@ -358,6 +368,9 @@ class XPlanesModel(Model):
         terms = super().losses(rendering, rays, state)
         if weight := self._passing_weight(state.step):
             terms["passing"] = weight * ray_mean(1 - rendering.opacity, rays)
+            border: Tensor | None = getattr(rendering, "border", None)
+            if self._is_rig and border is not None:
+                terms["passing"] = terms["passing"] + weight * border
         if (background := self._field.background) is not None:
             if (options := self.settings.background) is not None:
                 terms |= options.losses(background, rendering, rays, state)

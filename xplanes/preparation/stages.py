@@ -168,6 +168,8 @@ def convert_stage(
     """
     moving = model.plane_set != "three"
     sparse = parts.content["sparse"] if moving else None
+    texels = model.coarse_texels()
+    time_texels = model.time_texels or texels
 
     def initial_planes(dynamic: str, target: Tensor) -> Tensor:
         rows = model.time_resolution
@@ -176,7 +178,7 @@ def convert_stage(
             target,
             plane_set=model.plane_set,
             dynamic=dynamic,
-            resolution=model.time_texels or model.coarse_texels(),
+            resolution=time_texels,
             time_resolution=rows,
             noise=config.noise,
             generator=step_generator(seed, 0, Stream.NOISE),
@@ -184,7 +186,7 @@ def convert_stage(
 
     def make() -> dict[str, Any]:
         low_rank = parts.content["low_rank"].to(device)
-        space = space_planes(low_rank, static=config.static, resolution=model.coarse_texels())
+        space = space_planes(low_rank, static=config.static, resolution=texels)
         content: dict[str, Any] = {"space": space.cpu(), "time": None, "unexplained": {}}
         if sparse is not None:
             target = sparse.to(device)
@@ -198,8 +200,8 @@ def convert_stage(
 
     rows = PLANE_SETS[model.plane_set]  # A user's own plane set may change without a new name.
     of_time = [config.dynamic, config.noise, model.plane_set, rows, model.time_resolution]
-    of_time += [model.time_texels or model.coarse_texels(), seed]
-    inputs = [parts.key, config.static, model.coarse_texels(), of_time if moving else []]
+    of_time += [time_texels, seed]
+    inputs = [parts.key, config.static, texels, of_time if moving else []]
     return cache.stage("planes", inputs, make)
 
 

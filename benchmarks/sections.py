@@ -22,6 +22,8 @@ from xplanes import __version__
 from xplanes.config import compose_plain
 from xplanes.files import read_json, write_text
 from xplanes.lrm.weights import FOLDER as SHIPPED
+from xplanes.models.x_planes import USUAL_TEXELS
+from xplanes.synthetic.demo.suite import suite_scene
 from xplanes.synthetic.demo.write import SUITE_VERSION, VERSION
 
 Row = dict[str, Any]
@@ -44,6 +46,12 @@ NOT_MEASURED = re.compile(
     r"|trainer\.(?!max_|accumulate|g)"
 )
 """Settings that change nothing of what is measured: where things lie, what classes are called."""
+
+WITH_SURROUNDINGS = re.compile(
+    r"model\.background\..*|model\..*_with_background|model\.loss\.(rig_)?passing.*"
+    r"|model\.sampler\.(border|distortion)"
+)
+"""Settings that change nothing where the images show an object without surroundings."""
 
 
 class OutOfTimeError(Exception):
@@ -328,7 +336,7 @@ def why_stale(section: Section) -> str:
         if case not in record["settings"]:
             changes[f"{case} has not been measured"] = []
             continue
-        then = record["settings"][case]
+        then, settings = effective(record["settings"][case]), effective(settings)
         for key in sorted({*then, *settings}):
             old, new = then.get(key), settings.get(key)
             # A setting that did not exist, and is off now, changes nothing.
@@ -339,6 +347,17 @@ def why_stale(section: Section) -> str:
             changes[f"{words} ({cases[0]})"] = changes.pop(words)
     named, rest = list(changes)[:4], len(changes) - 4
     return ", ".join(named) + (f" and {rest} more changes" if rest > 0 else "")
+
+
+def effective(settings: Row) -> Row:
+    """Without the settings that change nothing in this scene."""
+    name, scene = settings.get("data.name"), settings.get("data.scene")
+    if name not in ("dnerf", "demo") and (name != "suite" or suite_scene(scene).world is not None):
+        return settings
+    found = {key: value for key, value in settings.items() if not WITH_SURROUNDINGS.match(key)}
+    if found.get("model.resolution") == "auto":
+        found["model.resolution"] = USUAL_TEXELS
+    return found
 
 
 def drift(section: Section, rows: list[Row]) -> list[tuple[str, str, str, str, str]]:

@@ -57,6 +57,27 @@ def test_a_record_is_stale_when_settings_of_what_it_measured_have_changed(record
     assert "version 1" in records.why_stale(old)
 
 
+@pytest.mark.parametrize(
+    ("scene", "stale"),
+    [
+        ({"data.name": "dnerf", "data.scene": "lego"}, False),
+        ({"data.name": "suite", "data.scene": "topology"}, False),
+        ({"data.name": "suite", "data.scene": "rig"}, True),
+        ({"data.name": "nerfstudio", "data.scene": "hand"}, True),
+    ],
+)
+def test_settings_of_surroundings_make_only_their_scenes_stale(records, scene, stale):
+    then = {**scene, "model.sampler.border": 0.1, "model.resolution": 64}
+    records.write_record("some", {"version": "1"}, {"one": then}, [])
+    now = {**then, "model.sampler.border": 0.2, "model.resolution": "auto"}
+    now["model.loss.rig_passing_steps"] = 600
+    words = records.why_stale(section(records, {"one": now}, []))
+    assert ("border" in words and "resolution" in words and "rig_passing" in words) is stale
+    assert bool(words) is stale
+    other = {**now, "model.loss.opacity": 0.2}
+    assert "opacity" in records.why_stale(section(records, {"one": other}, []))
+
+
 def test_what_does_not_change_a_measurement_is_not_among_its_settings(records):
     def settings(*changes: str) -> dict:
         return records.settings_of(("data.scene=balls", *changes))

@@ -123,6 +123,13 @@ def textured(images):
     images[:] = torch.where(images[..., 3:] > 0, images, noise)
 
 
+def world_to_camera():
+    scene = ball()
+    for views in scene.splits.values():
+        views.camera_to_world[:] = torch.linalg.inv(views.camera_to_world)
+    return scene
+
+
 def turned():
     """The ball with poses of OpenCV's axes."""
     scene = ball()
@@ -240,6 +247,10 @@ WRONG = {
         "one_time: .*train/000.png and train/004.png have one camera",
     ),
     "other axes": (turned, "axes: 16 of 16 cameras look away"),
+    "world-to-camera poses": (
+        world_to_camera,
+        "axes: the cameras' axes do not meet, but those of the inverse poses do",
+    ),
     "cameras astray": (astray, "astray: 4 of 16 cameras do not see"),
     "a small cube": (ball, "scale: .*too small", {"half_side": 0.05}),
     "a large cube": (ball, "scale: .*too large", {"half_side": 20.0}),

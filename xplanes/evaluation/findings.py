@@ -2,7 +2,7 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -26,6 +26,10 @@ ASTRAY = 0.1
 
 SMALL, LARGE = 0.03, 3.0
 """Range of plausible half sides of the cube, in units of the cameras' median distance."""
+
+ASUNDER, TOGETHER = 0.2, 0.1
+"""How far optical axes pass by one another, relative to the cameras' distance: poses that are
+probably wrong, and those that are right."""
 
 PALE_STEPS = 16
 """Colour difference, out of 255, below which two pixels count as equal."""
@@ -222,21 +226,39 @@ def calibrations(views: Views) -> list[tuple[float, ...]]:
 
 
 def _outward(views: Views) -> Finding | None:
-    """Finds cameras that look away from the point where their axes meet."""
-    axis = -backwards(views).double()
-    if not axes_meet(views):
-        return None  # Axes that are nearly parallel may meet anywhere.
-    to_centre = optical_centre(views).double() - views.camera_to_world[:, :3, 3].double()
-    away = int(((to_centre * axis).sum(dim=-1) < 0).sum())
-    if 2 * away <= len(views):
+    """Finds cameras that look away from the point where their axes meet, or at none at all."""
+    missed, away = _meeting(views)
+    inverse = replace(views, camera_to_world=torch.linalg.inv(views.camera_to_world))
+    if missed > ASUNDER and axes_meet(inverse) and _meeting(inverse)[0] < TOGETHER:
+        return Finding(
+            "axes",
+            "the cameras' axes do not meet, but those of the inverse poses do: the poses seem to "
+            "be world-to-camera. They must be camera-to-world: invert the matrix of every frame",
+        )
+    # Axes that are nearly parallel may meet anywhere.
+    if not axes_meet(views) or 2 * away <= len(views):
         return None
     return Finding(
         "axes",
         f"{away} of {len(views)} cameras look away from the point where their axes meet. Axes must "
         "be OpenGL's (x right, y up, z backward): if those of the file are OpenCV's (y down, z "
-        "forward), negate the second and third column of every pose. Cameras that do look outward, "
-        "as in a panorama, see no common volume",
+        "forward), negate the second and third column of every pose. Poses must be "
+        "camera-to-world: if those of the file are world-to-camera, invert them. Cameras that do "
+        "look outward, as in a panorama, see no common volume",
     )
+
+
+def _meeting(views: Views) -> tuple[float, int]:
+    """How far axes pass by the point nearest to all, and the number of cameras that look away.
+
+    The former is relative to the cameras' distance from the point.
+    """
+    offset = optical_centre(views).double() - views.camera_to_world[:, :3, 3].double()
+    axis = -backwards(views).double()
+    along = (offset * axis).sum(dim=-1)
+    beside = (offset - along[:, None] * axis).square().sum(dim=-1).mean()
+    distance = offset.square().sum(dim=-1).mean()
+    return float((beside / distance).sqrt()) if distance > 0 else 1.0, int((along < 0).sum())
 
 
 def pixels_of(views: Views, index: int, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -235,8 +235,9 @@ def scene_frame(views: Views, hints: CubeHints = NO_HINTS) -> Frame:
         raise SceneError(
             "the cameras look away from one another, so the scene's bounds cannot be found. Axes "
             "are OpenGL's: where those of the file are OpenCV's (y down, z forward), negate the "
-            "second and third column of every pose. If the poses are right, set data.half_side "
-            "and data.centre, in world units"
+            "second and third column of every pose; where those of the file are world-to-camera, "
+            "invert them. If the poses are right, set data.half_side and data.centre, in world "
+            "units"
         )
     if seen is not None:
         reach = (seen - centre).abs().max()

@@ -50,11 +50,13 @@ CLOCK = re.compile(
 
 DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_.T ]*(?:at )?"
-    r"(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)[s.]?(\d*)"
+    r"(\d\d|\d(?=[-_.:]\d\d[-_.:]))[-_.:h]?(\d\d)[-_.:m]?(\d\d)[s.]?(\d*)"
+    r"(?:[\s_.-]?(?i:(?P<half>[ap])\.?m\b))?"
 )
-"""Date and time of day, with parts of a second, as in PXL_20260102_115959250."""
+"""Date and time of day, with parts of a second or before or after noon, as in
+PXL_20260102_115959250 and 2026-01-02 at 1.59.59 PM."""
 
-MILLISECONDS = re.compile(DATE.pattern + r"[_-](\d{3})(?!\d)")
+MILLISECONDS = re.compile(DATE.pattern + r"[_-](?P<part>\d{3})(?!\d)")
 """Date, time of day and perhaps milliseconds, as in IMG_20260102_115959_250."""
 
 LEAST_STEP = 10
@@ -84,7 +86,9 @@ def times_in_names(
         advice: How to give other times, for warnings.
     """
     if times := times_of_clocks(names):
-        return _checked(names, times, advice)
+        # Twelve-hour clocks do not have the order of the names.
+        halves = any((date := DATE.search(name)) and date["half"] for name in names)
+        return times if halves else _checked(names, times, advice)
     stems = [PurePosixPath(name).stem for name in names]
     # If each folder is a timestep, file names are those of cameras.
     paths = [PurePosixPath(name).with_suffix("").as_posix() for name in names]
@@ -128,7 +132,7 @@ def _dates(stems: Sequence[str]) -> list[float | None]:
     times = [_date(stem) for stem in stems]
     matches = [MILLISECONDS.search(stem) for stem in stems]
     found = [
-        (time, int(match[8]))
+        (time, int(match["part"]))
         for time, match in zip(times, matches, strict=True)
         if time is not None and match is not None
     ]
@@ -145,9 +149,10 @@ def _date(stem: str) -> float | None:
     """Seconds of the date and time of day in a name."""
     if (match := DATE.search(stem)) is None:
         return None
-    *parts, fraction = match.groups()
+    *day, hour, minute, second, fraction, half = match.groups()
+    hour = int(hour) % 12 + 12 * (half in "pP") if half else hour
     try:
-        seconds = datetime(*map(int, parts), tzinfo=UTC).timestamp()
+        seconds = datetime(*map(int, (*day, hour, minute, second)), tzinfo=UTC).timestamp()
     except ValueError:
         return None
     return seconds + float(f"0.{fraction or 0}")

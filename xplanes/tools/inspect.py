@@ -33,7 +33,7 @@ from xplanes.scenes.views import Scene, Views
 from xplanes.tools.image_findings import ImageFacts, image_facts, image_findings, texel_findings
 from xplanes.tools.tabulate import markdown
 
-CONSEQUENCES = {"scale": ("cut", "texels"), "astray": ("cut",)}
+CONSEQUENCES = {"axes": ("cut",), "scale": ("cut", "texels"), "astray": ("cut",)}
 """Findings that are consequences of another one, and not shown with it."""
 
 ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".xz", ".7z", ".rar")

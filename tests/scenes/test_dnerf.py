@@ -130,6 +130,19 @@ def test_times_of_all_splits_are_mapped_together(tmp_path, write, found):
         assert views.times.tolist() == pytest.approx([found(time) for time in expected[split]])
 
 
+def test_numbers_in_names_are_the_times_of_an_animation_without_others(tmp_path):
+    scene = SceneFolder(tmp_path / "ball")
+    for split, count in (("train", 5), ("test", 3)):
+        scene.add(split, count)
+        for index in range(count):
+            scene.change(index, split, time=...)
+    assert scene.train().times.tolist() == [0] * 5
+    parts = scene.read(("train", "test"), static=False)
+    assert parts.splits["train"].times.tolist() == pytest.approx([0, 0.25, 0.5, 0.75, 1])
+    assert parts.splits["test"].times.tolist() == pytest.approx([0, 0.25, 0.5])
+    assert "numbers in their names" in parts.notes["times"]
+
+
 @pytest.mark.parametrize("time", [..., None])
 def test_a_frame_without_a_time_is_left_out(scene, time):
     scene.change(1, time=time)

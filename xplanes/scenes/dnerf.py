@@ -10,7 +10,14 @@ from xplanes.scenes.entries import SPLIT_FOLDERS, spelt
 from xplanes.scenes.listing import Listing
 from xplanes.scenes.masks import MaskUse
 from xplanes.scenes.source import SceneSettings, warn_of_masks
-from xplanes.scenes.transforms import all_masks, listing_of, read_frames, readable, time_span
+from xplanes.scenes.transforms import (
+    all_masks,
+    listing_of,
+    numbers,
+    read_frames,
+    readable,
+    time_span,
+)
 from xplanes.scenes.views import Scene
 
 
@@ -59,21 +66,28 @@ def read_scene(settings: SceneSettings, splits: Sequence[str], mask_use: MaskUse
         raise settings.no_scene()
     paths = {split: _transforms_path(folder, split) for split in dict.fromkeys(splits)}
     # All parts share a unit of time, and the meaning of masks.
-    contents = readable([folder / f"transforms_{part}.json" for part in SPLIT_FOLDERS])
+    parts = dict.fromkeys((*SPLIT_FOLDERS, *paths))
+    contents = readable([folder / f"transforms_{part}.json" for part in parts])
     span = time_span(contents.values())
-    listed = {split: _listed(split, path, span) for split, path in paths.items()}
+    numbered = numbers(contents.values()) if settings.static is False else None
+    listed = {split: _listed(split, path, span, numbered) for split, path in paths.items()}
     _warn_of_shared_files(folder, listed)
     listed = settings.thinned(listed)
-    video = _list_video(folder, span)
+    video = _list_video(folder, span, numbered)
     _require_times(folder, listed if video is None else {**listed, "video": video})
     # Masks mean the same whichever parts are read.
     return settings.scene_of(listed, mask_use, all_masks(contents), video=video)
 
 
-def _listed(split: str, path: Path, span: tuple[float, float] | None) -> Listing:
+def _listed(
+    split: str,
+    path: Path,
+    span: tuple[float, float] | None,
+    numbered: Mapping[str, float] | None,
+) -> Listing:
     """The frames of a split; if a scored split has none, warns before `MissingSplitError`."""
     try:
-        return listing_of(path, read_frames(path), span, movable=False)
+        return listing_of(path, read_frames(path), span, movable=False, numbered=numbered)
     except MissingSplitError as problem:
         if split != "train":
             first, *others = str(problem).splitlines()  # BlenderNeRF writes cameras without images.
@@ -127,11 +141,13 @@ def _transforms_path(folder: Path, split: str) -> Path:
     raise MissingSplitError(f"{path} does not exist. Splits of this scene: {names}. {way_out}")
 
 
-def _list_video(folder: Path, span: tuple[float, float] | None) -> Listing | None:
+def _list_video(
+    folder: Path, span: tuple[float, float] | None, numbered: Mapping[str, float] | None
+) -> Listing | None:
     path = folder / "transforms_video.json"
     if not path.is_file():
         return None
-    listing = listing_of(path, read_frames(path), span, movable=False)
+    listing = listing_of(path, read_frames(path), span, movable=False, numbered=numbered)
     poses = listing.camera_to_world
     if not poses.allclose(poses[:1].expand_as(poses), atol=1e-4):
         raise SceneError(

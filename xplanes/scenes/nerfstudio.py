@@ -10,7 +10,7 @@ from xplanes.scenes.entries import image_path, short, spelt
 from xplanes.scenes.listing import Listing, held_out
 from xplanes.scenes.rigs import is_rig
 from xplanes.scenes.source import CaptureSettings
-from xplanes.scenes.transforms import listing_of, read_frames, stated_up
+from xplanes.scenes.transforms import listing_of, numbers, read_frames, stated_up
 from xplanes.scenes.views import Scene
 
 SPLITS = ("train", "val", "test")
@@ -39,7 +39,9 @@ class NerfstudioSettings(CaptureSettings):
         if not path.is_file():
             raise self.no_scene()
         content = read_frames(path)
-        listing = listing_of(path, content, dynamic=self.static is False)
+        listing = listing_of(
+            path, content, numbered=numbers([content]) if self.static is False else None
+        )
         places = _listed_splits(path, content, listing)
         if places is None:
             places = held_out(listing, self.eval_every)

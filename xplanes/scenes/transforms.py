@@ -138,6 +138,20 @@ def time_span(contents: Iterable[Mapping[str, Any]]) -> tuple[float, float] | No
     return (min(times), max(times)) if times else None
 
 
+def numbers(contents: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """The numbers in the names of all images of several transforms files, by name.
+
+    Empty if a frame has a time, or if names have no number that varies.
+    """
+    contents = list(contents)
+    if time_span(contents) is not None:
+        return {}
+    entries = [entry for content in contents for entry in content["frames"]]
+    names = [name for entry in entries if isinstance(name := entry.get("file_path"), str)]
+    found = times_in_names(names, dynamic=True)
+    return dict(zip(names, found, strict=True)) if found else {}
+
+
 def all_masks(contents: Mapping[Path, Mapping[str, Any]]) -> tuple[list[Path | None], str]:
     """Masks of the usable images in several transforms files, and their meaning.
 
@@ -164,7 +178,7 @@ def listing_of(
     span: tuple[float, float] | None = None,
     *,
     movable: bool = True,
-    dynamic: bool = False,
+    numbered: Mapping[str, float] | None = None,
 ) -> Listing:
     """The frames of a transforms file, checked.
 
@@ -176,8 +190,7 @@ def listing_of(
         span: First and last time of the scene, if it has several files; those of this one when
             None.
         movable: As for `Listing.checked`: false if the scene has several files.
-        dynamic: Whether the scene is known to change: without times in the file, the numbers in the
-            names of the images are its times.
+        numbered: Result of `numbers`, if these are the times of a scene that has no others.
 
     Raises:
         SceneError: If anything is missing, out of range, repeated, or outside the scene's folder.
@@ -188,8 +201,10 @@ def listing_of(
     masks, meaning = _masks([(frame.image, frame.mask) for frame in frames])
     times, source = _times(path, frames, span)
     names = [frame.entry["file_path"] for frame in frames]
-    if dynamic and not times and (found := times_in_names(names, dynamic=True)):
-        times, source = unit_times(found), time_source("the numbers in their names", names, found)
+    if numbered and not times:
+        found = [numbered[name] for name in names]
+        times = unit_times(found, (min(numbered.values()), max(numbered.values())))
+        source = time_source("the numbers in their names", names, found)
     if content.get("enable_ray_loading", True):
         _warn_of_rays(path, paths)
     listing = Listing.checked(

@@ -14,7 +14,7 @@ from xplanes.rendering.sampler import Site
 from xplanes.scenes.frame import cube_frame
 from xplanes.streams import TrainingState
 
-STEPS_OF_A_RAY = {"training": 15, "pictures": 40}
+STEPS_OF_A_RAY = {"training": 16, "unpruned": 24, "pictures": 40}
 
 
 def fog(points, times):
@@ -41,9 +41,9 @@ def along_the_diagonal() -> dict[str, torch.Tensor]:
 
 
 def test_images_of_the_trained_field_have_samples_of_their_own(monkeypatch):
-    sampling = sampler(fog, "model.sampler.samples=15", "model.sampler.render_samples=40")
+    sampling = sampler(fog, "model.sampler.samples=16", "model.sampler.render_samples=40")
     seen = sampling.renderer.render(fog, **along_the_diagonal())
-    assert len(seen.samples) == STEPS_OF_A_RAY["training"]  # Nothing is pruned yet.
+    assert len(seen.samples) == STEPS_OF_A_RAY["unpruned"]
     monkeypatch.setattr(grid_renderer, "HALF_EMPTY", 1.0)
     seen = sampling.renderer.render(fog, **along_the_diagonal())
     assert len(seen.samples) == STEPS_OF_A_RAY["pictures"]

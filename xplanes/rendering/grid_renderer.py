@@ -41,11 +41,9 @@ BINS, MOST_BINS = 8, 16
 UNPRUNED = 0.9
 """Share of occupied cells above which an image searches for empty space first."""
 
-HALF_EMPTY = 0.4
-"""Share of occupied cells above which images have no more samples than training batches.
-
-A field that fills so much of the cube is too smooth to show a difference.
-"""
+HALF_EMPTY, SMOOTH = 0.4, 1.5
+"""Share of occupied cells above which images have at most this many times the samples of training
+batches: a field that fills so much of the cube is too smooth to gain from more."""
 
 SEARCHED_PER_RAY = 8
 """Cells per ray that an image searches for empty space at most, if nothing is pruned yet."""
@@ -226,8 +224,8 @@ class OccupancySettings(SamplerSettings):
     # Samples along the diagonal of the cube in training. auto: half the number of image pixels
     # along its side, from 128 to 256; 128 in scenes with surroundings.
     samples: Count | Literal["auto"]
-    # Samples along the diagonal in evaluation and videos; as in training while two fifths of the
-    # cells are occupied.
+    # Samples along the diagonal in evaluation and videos; at most one and a half times as many as
+    # in training while two fifths of the cells are occupied.
     render_samples: Count
     grid_resolution: Count  # Cells of the occupancy grid along each side.
     # Bins of the occupancy grid along time. auto: 8; one per timestep, up to 16, if four or more
@@ -397,7 +395,7 @@ class OccupancySampler(Sampler):
     def renderer(self) -> GridRenderer:
         renderer, least = self._image_renderer, self._training_renderer.samples
         if renderer.samples > least and self.grid.occupied_fraction > HALF_EMPTY:
-            return replace(renderer, samples=least)
+            return replace(renderer, samples=min(renderer.samples, round(SMOOTH * least)))
         return renderer
 
     @property

@@ -53,6 +53,9 @@ WITH_SURROUNDINGS = re.compile(
 )
 """Settings that change nothing where the images show an object without surroundings."""
 
+POSITIONS = 50
+"""Least number of camera positions in the scenes without surroundings that are measured."""
+
 
 class OutOfTimeError(Exception):
     """The minutes of a measurement are over; finished runs are kept.
@@ -357,6 +360,8 @@ def effective(settings: Row) -> Row:
     found = {key: value for key, value in settings.items() if not WITH_SURROUNDINGS.match(key)}
     if found.get("model.resolution") == "auto":
         found["model.resolution"] = USUAL_TEXELS
+    if found.get("data.views") is None and found.get("model.loss.variation_views", 0) <= POSITIONS:
+        found.pop("model.loss.variation_views", None)
     return found
 
 

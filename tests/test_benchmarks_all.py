@@ -74,6 +74,11 @@ def test_settings_of_surroundings_make_only_their_scenes_stale(records, scene, s
     words = records.why_stale(section(records, {"one": now}, []))
     assert ("border" in words and "resolution" in words and "rig_passing" in words) is stale
     assert bool(words) is stale
+    now["model.loss.variation_views"] = 50  # All images, from more places than that.
+    assert ("variation" in records.why_stale(section(records, {"one": now}, []))) is stale
+    few = {**now, "data.views": 5}
+    records.write_record("some", {"version": "1"}, {"one": {**then, "data.views": 5}}, [])
+    assert "variation" in records.why_stale(section(records, {"one": few}, []))
     other = {**now, "model.loss.opacity": 0.2}
     assert "opacity" in records.why_stale(section(records, {"one": other}, []))
 

@@ -360,8 +360,9 @@ def effective(settings: Row) -> Row:
     found = {key: value for key, value in settings.items() if not WITH_SURROUNDINGS.match(key)}
     if found.get("model.resolution") == "auto":
         found["model.resolution"] = USUAL_TEXELS
-    if found.get("data.views") is None and found.get("model.loss.variation_views", 0) <= POSITIONS:
-        found.pop("model.loss.variation_views", None)
+    views = found.get("model.loss.variation_views")
+    if found.get("data.views") is None and (views or 0) <= POSITIONS:
+        found["model.loss.variation_views"] = None
     return found
 
 

@@ -14,7 +14,7 @@ from xplanes.rendering.sampler import Site
 from xplanes.scenes.frame import cube_frame
 from xplanes.streams import TrainingState
 
-STEPS_OF_A_RAY = {"training": 16, "unpruned": 24, "pictures": 40}
+STEPS_OF_A_RAY = {"training": 16, "smooth": 24, "pictures": 40}
 
 
 def fog(points, times):
@@ -42,11 +42,11 @@ def along_the_diagonal() -> dict[str, torch.Tensor]:
 
 def test_images_of_the_trained_field_have_samples_of_their_own(monkeypatch):
     sampling = sampler(fog, "model.sampler.samples=16", "model.sampler.render_samples=40")
-    seen = sampling.renderer.render(fog, **along_the_diagonal())
-    assert len(seen.samples) == STEPS_OF_A_RAY["unpruned"]
-    monkeypatch.setattr(grid_renderer, "HALF_EMPTY", 1.0)
-    seen = sampling.renderer.render(fog, **along_the_diagonal())
-    assert len(seen.samples) == STEPS_OF_A_RAY["pictures"]
+    for name, kind in (("", "training"), ("UNPRUNED", "smooth"), ("HALF_EMPTY", "pictures")):
+        if name:
+            monkeypatch.setattr(grid_renderer, name, 1.0)
+        seen = sampling.renderer.render(fog, **along_the_diagonal())
+        assert len(seen.samples) == STEPS_OF_A_RAY[kind]
     state = TrainingState(0, sampling.pruned_at, 0, 0)
     trained = sampling.render(fog, along_the_diagonal(), state)
     assert len(trained.samples) == STEPS_OF_A_RAY["training"]

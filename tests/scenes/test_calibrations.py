@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from functools import partial
 from pathlib import Path
 
@@ -281,6 +282,10 @@ def test_other_panels_of_panoptic_need_not_be_there(tmp_path):
     content["cameras"] += [{**content["cameras"][0], "name": "01_01", "type": "vga"}]
     path.write_text(json.dumps(content))
     with told(None):
+        assert len(read(tmp_path).splits["train"]) == 12
+    (first,) = (path for path in tmp_path.rglob("00_00") if path.is_dir())
+    shutil.copytree(first, first.with_name("01_01"))
+    with told("HD cameras are read, and not 01_01, which have other rates|no camera of 01_01"):
         assert len(read(tmp_path).splits["train"]) == 12
 
 

@@ -394,6 +394,16 @@ def test_captures_tell_of_videos_that_are_not_read(copied):
         read_images()
 
 
+def test_a_camera_that_stopped_early_is_left_out(images):
+    for path in sorted((images / "cam02").iterdir())[2:]:
+        path.unlink()
+    with told(r"cam02 \(2\) have fewer than 50% of the 6 frames of other cameras, and are left"):
+        scene = read(images)
+    assert len(scene.splits["train"]) == (CAMERAS - 2) * FRAMES
+    with told("not all cameras have an image of the numbers of cam00"):
+        assert len(read(images, test_cameras=["cam02"]).splits["test"]) == 2
+
+
 @pytest.mark.parametrize("image", ["images/cam{:02d}.png", "cam{:02d}/0001.png"])
 def test_frames_that_name_an_image_of_a_camera_mean_its_video(copied, image):
     (copied / "poses_bounds.npy").unlink()

@@ -192,7 +192,7 @@ def _recordings_of_any_name(folder: Path, calibration: Path) -> dict[str, Path]:
     found = [path for p in (folder, *own) for path in sorted(filter(_is_recording, p.iterdir()))]
     # EasyMocap extracts images from videos, and programs write folders of the same names.
     found.sort(key=lambda path: (path.is_file(), path.parent.name.lower() in IMAGES))
-    return {camera_name(path).removeprefix("hd_"): path for path in found if _is_filled(path)}
+    return {re.sub("^(hd|vga)_", "", camera_name(p)): p for p in found if _is_filled(p)}
 
 
 def recordings_below(folder: Path, *others: str) -> list[Path]:
@@ -307,12 +307,12 @@ def read_poses_bounds(
         row, label = rows[index], f"{path}: row {index} ({sources[index].name})"
         matrix = row[:15].astype(np.float64).reshape(3, 5)
         down, right, back, centre, (height, width, focal) = matrix.T
-        for key, value in (("height", height), ("width", width), ("focal length", focal)):
-            if not is_positive(float(value)):
-                raise SceneError(f"{label}: {key} is {value:g}; it must be above 0. Export again.")
         pose = np.eye(4)
         pose[:3] = np.stack([right, -down, back, centre], axis=1)
         pose = checked_pose(label, pose, "the pose")
+        for key, value in (("height", height), ("width", width), ("focal length", focal)):
+            if not is_positive(float(value)):
+                raise SceneError(f"{label}: {key} is {value:g}; it must be above 0. Export again.")
         calibration = Calibration(fl_x=float(focal), w=float(width), h=float(height))
         return sources[index], label, pose, calibration
 
@@ -437,6 +437,14 @@ def _from_calibration(folder: Path, path: Path) -> list[Camera]:
     if path.match("calibration_*"):  # Panels of CMU Panoptic are recorded, and fetched, as a whole.
         panels = {camera.name.split("_")[0] for camera in cameras}
         lost = [name for name in lost if name.split("_")[0] in panels]
+        kinds = Counter(_kind_of_panel(camera) for camera in cameras)
+        usual = max(kinds, key=kinds.__getitem__)
+        if len(kinds) > 1:
+            slower = [camera.name for camera in cameras if _kind_of_panel(camera) != usual]
+            cameras = [camera for camera in cameras if camera.name not in slower]
+            warn(
+                f"{path}: {usual} cameras are read, and not {some(slower)}, which have other rates."
+            )
     read = {camera.source for camera in cameras}
     others = [other for other in _colours([*sources.values()]) if other not in read]
     if others := [other.name for other in others if other.parent in {own.parent for own in read}]:
@@ -450,6 +458,11 @@ def _from_calibration(folder: Path, path: Path) -> list[Camera]:
             f"images of their name and are left out: {some(lost)}."
         )
     return cameras
+
+
+def _kind_of_panel(camera: Camera) -> str:
+    """Kind of a camera of CMU Panoptic by its panel; kinds differ in their rates."""
+    return {"00": "HD", "50": "Kinect"}.get(camera.name.split("_")[0], "VGA")
 
 
 def _counted(model: SparseModel, recordings: Sequence[Path]) -> dict[str, list[Path]]:

@@ -1,5 +1,6 @@
 """Numbers of samples in training steps and in images."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -40,9 +41,12 @@ def along_the_diagonal() -> dict[str, torch.Tensor]:
     }
 
 
-def test_images_of_the_trained_field_have_samples_of_their_own(monkeypatch):
+@pytest.mark.parametrize("surrounded", [False, True])
+def test_images_of_the_trained_field_have_samples_of_their_own(monkeypatch, surrounded):
     sampling = sampler(fog, "model.sampler.samples=16", "model.sampler.render_samples=40")
-    for name, kind in (("", "training"), ("UNPRUNED", "smooth"), ("HALF_EMPTY", "pictures")):
+    sampling._training_renderer = replace(sampling._training_renderer, surrounded=surrounded)
+    soft = "smooth" if surrounded else "training"
+    for name, kind in (("", "training"), ("UNPRUNED", soft), ("HALF_EMPTY", "pictures")):
         if name:
             monkeypatch.setattr(grid_renderer, name, 1.0)
         seen = sampling.renderer.render(fog, **along_the_diagonal())

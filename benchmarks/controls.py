@@ -155,7 +155,8 @@ def _noise(model: XPlanesSettings, seed: int) -> Mapping[str, Tensor]:
     """Planes as without an LRM."""
     assert isinstance(model.time_resolution, int)
     generator = step_generator(seed, 0, Stream.INITIAL_FIELD)
-    return model.random_planes(model.plane_set, model.time_resolution, generator)
+    texels = model.coarse_texels()
+    return model.random_planes(model.plane_set, model.time_resolution, texels, generator)
 
 
 def _by_median(triplanes: Tensor, model: XPlanesSettings, method: Method) -> dict[str, object]:

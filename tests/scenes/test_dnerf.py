@@ -141,6 +141,13 @@ def test_numbers_in_names_are_the_times_of_an_animation_without_others(tmp_path)
     assert parts.splits["train"].times.tolist() == pytest.approx([0, 0.25, 0.5, 0.75, 1])
     assert parts.splits["test"].times.tolist() == pytest.approx([0, 0.25, 0.5])
     assert "numbers in their names" in parts.notes["times"]
+    # BlenderNeRF lists cameras that it does not render.
+    first = scene.frames("test")[0]
+    names = [f"./test/r_{9 + index}" for index in range(9)]
+    scene.contents["test"]["frames"] += [{**first, "file_path": name} for name in names]
+    with told("9 of 12 frames are left out"):
+        parts = scene.read(("train", "test"), static=False)
+    assert parts.splits["train"].times.tolist() == pytest.approx([0, 0.25, 0.5, 0.75, 1])
 
 
 @pytest.mark.parametrize("time", [..., None])

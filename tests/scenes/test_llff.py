@@ -102,6 +102,8 @@ def test_rows_that_are_not_finite_are_left_out(folder):
 
 def test_other_numbers_of_images_than_of_rows(folder):
     (folder / "images/IMG_4.JPG").unlink()
+    assert read(folder).splits["train"].files[0].startswith("images_2/")
+    next(path for path in (folder / "images_2").iterdir() if "IMG_4" in path.name).unlink()
     refused(lambda: read(folder), "has 10 cameras, but .* holds 9")
     (folder / "poses_bounds.npy").unlink()
     refused(lambda: read(folder), "holds no poses_bounds.npy and")

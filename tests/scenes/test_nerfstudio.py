@@ -479,6 +479,14 @@ def test_a_colour_may_be_transparent(capture, level):
 # Files
 
 
+def test_coefficients_of_minus_one_are_none(tmp_path):
+    capture = Capture(tmp_path, 3, k1=0.02, k2=0.001, p1=-1, p2=-1)
+    with told("p1, p2 are -1, as agi2nerf writes it for none"):
+        lenses = capture.all(resolution=8).intrinsics.lenses
+    found = dict(zip(COEFFICIENTS, lenses.coefficients[0].tolist(), strict=True))
+    assert {key: value for key, value in found.items() if value} == {"k1": 0.02, "k2": 0.001}
+
+
 def test_a_mark_at_the_start_and_comments_are_read(capture):
     expected = capture.all().camera_to_world
     path = capture.path / "transforms.json"

@@ -24,7 +24,7 @@ from xplanes.cli import main
 from xplanes.components import build
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
-from xplanes.evaluation.findings import camera_findings
+from xplanes.evaluation.findings import _outward, camera_findings
 from xplanes.models.base import ModelSettings
 from xplanes.run import run
 from xplanes.scenes.cameras import look_at
@@ -135,6 +135,18 @@ def turned():
     scene = ball()
     scene.splits["train"].camera_to_world[..., 1:3] *= -1
     return scene
+
+
+def test_cameras_that_walk_on_are_not_taken_for_inverse_poses():
+    train = ball().splits["train"]
+    steps = torch.linspace(0, 1, COUNT)
+    turn = 0.4 * torch.sin(9 * steps)
+    poses = torch.eye(4).repeat(COUNT, 1, 1)
+    poses[:, 0, 0], poses[:, 0, 2] = turn.cos(), turn.sin()
+    poses[:, 2, 0], poses[:, 2, 2] = -turn.sin(), turn.cos()
+    poses[:, 0, 3], poses[:, 2, 3] = 0.2 * torch.sin(5 * steps), -10 * steps
+    finding = _outward(replace(train, camera_to_world=poses))
+    assert finding is None or "inverse" not in finding.text
 
 
 def rig(count=4):

@@ -1,5 +1,6 @@
 """Numbers of samples in training steps and in images."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from xplanes.rendering.sampler import Site
 from xplanes.scenes.frame import cube_frame
 from xplanes.streams import TrainingState
 
-STEPS_OF_A_RAY = {"training": 16, "unpruned": 24, "pictures": 40}
+STEPS_OF_A_RAY = {"training": 16, "smooth": 24, "pictures": 40}
 
 
 def fog(points, times):
@@ -40,13 +41,16 @@ def along_the_diagonal() -> dict[str, torch.Tensor]:
     }
 
 
-def test_images_of_the_trained_field_have_samples_of_their_own(monkeypatch):
+@pytest.mark.parametrize("surrounded", [False, True])
+def test_images_of_the_trained_field_have_samples_of_their_own(monkeypatch, surrounded):
     sampling = sampler(fog, "model.sampler.samples=16", "model.sampler.render_samples=40")
-    seen = sampling.renderer.render(fog, **along_the_diagonal())
-    assert len(seen.samples) == STEPS_OF_A_RAY["unpruned"]
-    monkeypatch.setattr(grid_renderer, "HALF_EMPTY", 1.0)
-    seen = sampling.renderer.render(fog, **along_the_diagonal())
-    assert len(seen.samples) == STEPS_OF_A_RAY["pictures"]
+    sampling._training_renderer = replace(sampling._training_renderer, surrounded=surrounded)
+    soft = "smooth" if surrounded else "training"
+    for name, kind in (("", "training"), ("UNPRUNED", soft), ("HALF_EMPTY", "pictures")):
+        if name:
+            monkeypatch.setattr(grid_renderer, name, 1.0)
+        seen = sampling.renderer.render(fog, **along_the_diagonal())
+        assert len(seen.samples) == STEPS_OF_A_RAY[kind]
     state = TrainingState(0, sampling.pruned_at, 0, 0)
     trained = sampling.render(fog, along_the_diagonal(), state)
     assert len(trained.samples) == STEPS_OF_A_RAY["training"]

@@ -31,6 +31,9 @@ ASUNDER, TOGETHER = 0.2, 0.1
 """How far optical axes pass by one another, relative to the cameras' distance: poses that are
 probably wrong, and those that are right."""
 
+EVEN = 0.35
+"""Least distance from the point where axes meet of nine in ten cameras, in units of the median."""
+
 PALE_STEPS = 16
 """Colour difference, out of 255, below which two pixels count as equal."""
 
@@ -227,15 +230,24 @@ def calibrations(views: Views) -> list[tuple[float, ...]]:
 
 def _outward(views: Views) -> Finding | None:
     """Finds cameras that look away from the point where their axes meet, or at none at all."""
-    missed, away = _meeting(views)
+    along, missed = _meeting(views)
     inverse = replace(views, camera_to_world=torch.linalg.inv(views.camera_to_world))
-    if missed > ASUNDER and axes_meet(inverse) and _meeting(inverse)[0] < TOGETHER:
-        return Finding(
-            "axes",
-            "the cameras' axes do not meet, but those of the inverse poses do: the poses seem to "
-            "be world-to-camera. They must be camera-to-world: invert the matrix of every frame",
-        )
+    if missed > ASUNDER and axes_meet(inverse):
+        ahead, missed = _meeting(inverse)
+        # Cameras that walk straight on seem to orbit a point as well, but at any distance from it.
+        distance = ahead.abs()
+        orbits = distance.quantile(0.1) > EVEN * distance.median()
+        if missed < TOGETHER and orbits:
+            then = " and then negate its second and third column (OpenCV's axes)"
+            return Finding(
+                "axes",
+                "the cameras' axes do not meet, but those of the inverse poses do: the poses seem "
+                "to be world-to-camera. They must be camera-to-world: invert the matrix of every "
+                f"frame{then if (ahead < 0).double().mean() > 0.5 else ''}. A camera that turns on "
+                "the spot gives the same picture, but sees no common volume",
+            )
     # Axes that are nearly parallel may meet anywhere.
+    away = int((along < 0).sum())
     if not axes_meet(views) or 2 * away <= len(views):
         return None
     return Finding(
@@ -248,17 +260,17 @@ def _outward(views: Views) -> Finding | None:
     )
 
 
-def _meeting(views: Views) -> tuple[float, int]:
-    """How far axes pass by the point nearest to all, and the number of cameras that look away.
+def _meeting(views: Views) -> tuple[Tensor, float]:
+    """Depth in each camera of the point nearest to all axes, and how far these pass by it.
 
-    The former is relative to the cameras' distance from the point.
+    The latter is relative to the cameras' distance from the point.
     """
     offset = optical_centre(views).double() - views.camera_to_world[:, :3, 3].double()
     axis = -backwards(views).double()
     along = (offset * axis).sum(dim=-1)
     beside = (offset - along[:, None] * axis).square().sum(dim=-1).mean()
     distance = offset.square().sum(dim=-1).mean()
-    return float((beside / distance).sqrt()) if distance > 0 else 1.0, int((along < 0).sum())
+    return along, float((beside / distance).sqrt()) if distance > 0 else 1.0
 
 
 def pixels_of(views: Views, index: int, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -42,8 +42,8 @@ UNPRUNED = 0.9
 """Share of occupied cells above which an image searches for empty space first."""
 
 HALF_EMPTY, SMOOTH = 0.4, 1.5
-"""Share of occupied cells above which images have at most this many times the samples of training
-batches: a field that fills so much of the cube is too smooth to gain from more."""
+"""Share of occupied cells above which a field is too smooth for images to gain from more samples
+than training batches have, but for some more with surroundings, in this proportion."""
 
 SEARCHED_PER_RAY = 8
 """Cells per ray that an image searches for empty space at most, if nothing is pruned yet."""
@@ -224,8 +224,9 @@ class OccupancySettings(SamplerSettings):
     # Samples along the diagonal of the cube in training. auto: half the number of image pixels
     # along its side, from 128 to 256; 128 in scenes with surroundings.
     samples: Count | Literal["auto"]
-    # Samples along the diagonal in evaluation and videos; at most one and a half times as many as
-    # in training while two fifths of the cells are occupied.
+    # Samples along the diagonal in evaluation and videos; as many as in training while two fifths
+    # of the cells are occupied, or one and a half times as many in scenes with surroundings while
+    # nine tenths are not.
     render_samples: Count
     grid_resolution: Count  # Cells of the occupancy grid along each side.
     # Bins of the occupancy grid along time. auto: 8; one per timestep, up to 16, if four or more
@@ -394,8 +395,11 @@ class OccupancySampler(Sampler):
     @property
     def renderer(self) -> GridRenderer:
         renderer, least = self._image_renderer, self._training_renderer.samples
-        if renderer.samples > least and self.grid.occupied_fraction > HALF_EMPTY:
-            return replace(renderer, samples=min(renderer.samples, round(SMOOTH * least)))
+        occupied = self.grid.occupied_fraction
+        soft = self._training_renderer.surrounded and occupied <= UNPRUNED
+        most = round(SMOOTH * least) if soft else least
+        if renderer.samples > most and occupied > HALF_EMPTY:
+            return replace(renderer, samples=most)
         return renderer
 
     @property

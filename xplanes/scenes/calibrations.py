@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from xplanes.errors import SceneError
+from xplanes.errors import SceneError, warn
 from xplanes.scenes.entries import checked_pose, decoded, parsed, reading, short, some, usable
 from xplanes.scenes.listing import Calibration
 from xplanes.scenes.transforms import read_calibration
@@ -124,15 +124,30 @@ def _easymocap(path: Path, content: str) -> Iterable[Camera]:
         if side:
             found[side, owner.strip()] = float(length)
         else:
-            values = [float(number) for number in re.split(r"[,\s]+", data.strip(", \r\n"))]
+            numbers = re.split(r"[,\s]+", data.strip(", \r\n"))
+            values = [float(number.lstrip(".") if "a" in number else number) for number in numbers]
             found[kind, name.strip()] = np.reshape(values, (int(rows), int(columns)))
-    for name in dict.fromkeys(map(str.strip, OWNER.findall(text))):
+    names = [*dict.fromkeys(map(str.strip, OWNER.findall(text)))]
+    wanted = [("K",), ("T",), ("R", "Rot")]
+    lost = [
+        name
+        for name in names
+        if not all(any((key, name) in found for key in keys) for keys in wanted)
+    ]
+    if lost and len(lost) < len(names):  # EasyMocap leaves out cameras that saw no board.
+        warn(f"{path} and intri.yml: {some(lost)} lack K, R or T, and are left out.")
+        names = [name for name in names if name not in lost]
+    for name in names:
         rotation = found["Rot", name] if ("Rot", name) in found else found["R", name]
         distortion = found.get(("dist", name), found.get(("D", name), []))
         size = {key.lower(): found[key, name] for key in "WH" if (key, name) in found}
         label = f"{path.with_name('intri.yml')}: {name}"
         # Pixel centres are at whole numbers in OpenCV.
         lens = _lens(label, found["K", name], distortion, corner=0.5)
+        if np.any(np.abs(found.get(("rdist", name), 0)) > NONE):
+            raise SceneError(
+                f"{label}: rdist, a fisheye lens of EasyVolcap, is not read. Undistort the images."
+            )
         yield name, rotation, found["T", name], lens | size
 
 

@@ -69,7 +69,7 @@ def read_scene(settings: SceneSettings, splits: Sequence[str], mask_use: MaskUse
     parts = dict.fromkeys((*SPLIT_FOLDERS, *paths))
     contents = readable([folder / f"transforms_{part}.json" for part in parts])
     span = time_span(contents.values())
-    numbered = numbers(contents.values()) if settings.static is False else None
+    numbered = numbers(contents) if settings.static is False else None
     listed = {split: _listed(split, path, span, numbered) for split, path in paths.items()}
     _warn_of_shared_files(folder, listed)
     listed = settings.thinned(listed)

@@ -457,7 +457,8 @@ def _warn_of_other_units(
         warn(
             f"{far[0]}; so do those of {len(far)} of {len(labels)} cameras or images. Unless these "
             "were cropped, the calibration is for images of another size, which must be given "
-            "(w and h in transforms files), or is not in pixels: correct it."
+            "(w and h in transforms files, W_ and H_ in intri.yml), or is not in pixels: correct "
+            "it."
         )
 
 

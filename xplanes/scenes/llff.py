@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from xplanes.scenes.colmap import ColmapSettings
-from xplanes.scenes.entries import unit_times
+from xplanes.scenes.entries import read_array, unit_times
 from xplanes.scenes.formats import is_image
 from xplanes.scenes.images import native_sizes, width_rank
 from xplanes.scenes.listing import Listing, held_out, time_source
@@ -41,6 +41,9 @@ class LlffSettings(CaptureSettings):
         path = self.folder / POSES
         if not (path.is_file() and (found := _image_folders(self.folder))):
             raise self.no_scene()
+        rows = len(read_array(path, "Export or download it again."))
+        # A folder of copies may lack some.
+        found = [images for images in found if len(images) == rows] or found
         images = min(
             found, key=lambda each: width_rank(native_sizes(each[:1])[0][1], self.resolution)
         )

@@ -63,6 +63,9 @@ logger = logging.getLogger(__name__)
 MOST_DRIFT = 0.5
 """Largest drift between synchronised cameras until the shortest of them ends, in frames."""
 
+SHORT = 0.5
+"""Share of the usual number of frames below which a camera stopped early."""
+
 NEAR = 0.3
 """A larger difference between times of images, in intervals, is one between timesteps."""
 
@@ -122,6 +125,8 @@ class MultiCameraSettings(SceneSettings):
             raise self.no_scene()
         cameras, content = read_cameras(folder)
         found = usable("cameras", _recording, cameras)
+        if self.frames is None:
+            found = _without_short(folder, found, [*(self.test_cameras or ()), self.video_camera])
         cameras = [each.camera for each in found]
         parts = _split_cameras(folder, cameras, self.test_cameras)
         for split in splits:
@@ -190,6 +195,28 @@ class Recording:
     def step(self) -> float:
         """Median seconds between frames; 0 if unknown."""
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
+
+
+def _without_short(
+    folder: Path, recordings: list[Recording], named: Sequence[str | None]
+) -> list[Recording]:
+    """Without cameras that stopped early, as only frames of all cameras are read.
+
+    Args:
+        folder: The scene's folder, for the warning.
+        recordings: All cameras.
+        named: Names of cameras that stay.
+    """
+    usual = float(np.median([recording.count for recording in recordings]))
+    short = [r for r in recordings if r.count < SHORT * usual and r.camera.name not in named]
+    if not short or len(recordings) - len(short) < 2:
+        return recordings
+    names = some([f"{recording.camera.name} ({recording.count})" for recording in short])
+    warn(
+        f"{folder}: {names} have fewer than {SHORT:.0%} of the {usual:g} frames of other cameras, "
+        "and are left out. data.frames reads a range of the frames of all cameras."
+    )
+    return [recording for recording in recordings if recording not in short]
 
 
 def _split_cameras(

@@ -40,7 +40,7 @@ class NerfstudioSettings(CaptureSettings):
             raise self.no_scene()
         content = read_frames(path)
         listing = listing_of(
-            path, content, numbered=numbers([content]) if self.static is False else None
+            path, content, numbered=numbers({path: content}) if self.static is False else None
         )
         places = _listed_splits(path, content, listing)
         if places is None:

@@ -192,7 +192,7 @@ def _recordings_of_any_name(folder: Path, calibration: Path) -> dict[str, Path]:
     found = [path for p in (folder, *own) for path in sorted(filter(_is_recording, p.iterdir()))]
     # EasyMocap extracts images from videos, and programs write folders of the same names.
     found.sort(key=lambda path: (path.is_file(), path.parent.name.lower() in IMAGES))
-    return {camera_name(path).removeprefix("hd_"): path for path in found if _is_filled(path)}
+    return {re.sub("^(hd|vga)_", "", camera_name(p)): p for p in found if _is_filled(p)}
 
 
 def recordings_below(folder: Path, *others: str) -> list[Path]:
@@ -307,12 +307,12 @@ def read_poses_bounds(
         row, label = rows[index], f"{path}: row {index} ({sources[index].name})"
         matrix = row[:15].astype(np.float64).reshape(3, 5)
         down, right, back, centre, (height, width, focal) = matrix.T
-        for key, value in (("height", height), ("width", width), ("focal length", focal)):
-            if not is_positive(float(value)):
-                raise SceneError(f"{label}: {key} is {value:g}; it must be above 0. Export again.")
         pose = np.eye(4)
         pose[:3] = np.stack([right, -down, back, centre], axis=1)
         pose = checked_pose(label, pose, "the pose")
+        for key, value in (("height", height), ("width", width), ("focal length", focal)):
+            if not is_positive(float(value)):
+                raise SceneError(f"{label}: {key} is {value:g}; it must be above 0. Export again.")
         calibration = Calibration(fl_x=float(focal), w=float(width), h=float(height))
         return sources[index], label, pose, calibration
 
@@ -331,7 +331,11 @@ def _from_transforms(folder: Path, content: Mapping[str, Any]) -> list[Camera]:
         label, name = f"{path}: frame {index} ({frame['file_path']})", frame["file_path"]
         source = _source(label, folder.resolve(), name, named)
         if source.is_dir() and is_image(image := Path(spelt(name))):
-            source = named.get(image.stem, source)
+            # A folder has an image of each camera, all frames of one, or one of its video.
+            if source.name not in named:
+                source = named.get(image.stem, source)
+            elif len(images_in(source)) == 1:
+                source = named[source.name]
         return label, frame, source, checked_pose(label, frame["transform_matrix"])
 
     for label, frame, source, pose in usable("frames", located, [*enumerate(content["frames"])]):
@@ -387,9 +391,17 @@ def _from_colmap(folder: Path, place: Path) -> list[Camera]:
             words = " or of ".join(path.name for path in found)
             problems.append(f"{name} may be of {words or 'no video or folder'}")
     known = {camera_name(path) for path, names in owned.items() if names}
+    lost = [path.name for path in owned if camera_name(path) not in known]
     for path, names in owned.items():
-        if len(names) > 1 or camera_name(path) not in known:
-            problems.append(f"{some(names) or 'no registered image'} belongs to {path.name}")
+        if len(names) > 1:
+            problems.append(f"{some(names)} belongs to {path.name}")
+    if lost and not problems and len(known) > 1:  # COLMAP may lose a camera of a sparse rig.
+        warn(
+            f"{model.source} has no registered image of {some(lost)}: {len(lost)} of "
+            f"{len(lost) + len(known)} cameras are left out."
+        )
+    else:
+        problems += [f"no registered image belongs to {name}" for name in lost]
     folders = Counter(PurePosixPath(name).parent for name in model.names)
     if problems and len(folders) > 1 and min(folders.values()) > 1:
         raise SceneError(
@@ -425,6 +437,14 @@ def _from_calibration(folder: Path, path: Path) -> list[Camera]:
     if path.match("calibration_*"):  # Panels of CMU Panoptic are recorded, and fetched, as a whole.
         panels = {camera.name.split("_")[0] for camera in cameras}
         lost = [name for name in lost if name.split("_")[0] in panels]
+        kinds = Counter(_kind_of_panel(camera) for camera in cameras)
+        usual = max(kinds, key=kinds.__getitem__)
+        if len(kinds) > 1:
+            slower = [camera.name for camera in cameras if _kind_of_panel(camera) != usual]
+            cameras = [camera for camera in cameras if camera.name not in slower]
+            warn(
+                f"{path}: {usual} cameras are read, and not {some(slower)}, which have other rates."
+            )
     read = {camera.source for camera in cameras}
     others = [other for other in _colours([*sources.values()]) if other not in read]
     if others := [other.name for other in others if other.parent in {own.parent for own in read}]:
@@ -440,26 +460,46 @@ def _from_calibration(folder: Path, path: Path) -> list[Camera]:
     return cameras
 
 
-def _counted(model: SparseModel, recordings: Sequence[Path]) -> dict[str, list[Path]]:
-    """Recordings by image1, image2, ..., in order; empty if images have other names.
+def _kind_of_panel(camera: Camera) -> str:
+    """Kind of a camera of CMU Panoptic by its panel; kinds differ in their rates."""
+    return {"00": "HD", "50": "Kinect"}.get(camera.name.split("_")[0], "VGA")
 
-    4DGaussians copies an image of each camera to these names.
+
+def _counted(model: SparseModel, recordings: Sequence[Path]) -> dict[str, list[Path]]:
+    """Recordings by image1, image2, ...; empty if images have other names.
+
+    4DGaussians copies an image of each camera to these names, with the number of cam01 and the
+    like. Without such numbers they are counted.
     """
-    named = {camera_name(path): path for path in recordings}
-    counted = {f"image{place}": [path] for place, path in enumerate(named.values(), start=1)}
-    if sorted(counted) != sorted(PurePosixPath(name).stem for name in model.names):
+    named = sorted((camera_name(path), path) for path in recordings)
+    named.sort(key=lambda each: natural(each[0]))
+    numbers = [int(match[0]) for name, _ in named if (match := re.search(r"\d+$", name))]
+    if len(numbers) < len(named) or 0 in numbers:
+        numbers = range(1, len(named) + 1)
+    counted = {f"image{n}": [path] for n, (_, path) in zip(numbers, named, strict=True)}
+    if not {PurePosixPath(name).stem for name in model.names} <= {*counted}:
         return {}
     warn(
-        f"{model.source}: image1, image2, ... are taken for images of {some([*named])}, in this "
-        "order. If they are not, give them the cameras' names."
+        f"{model.source}: image1, image2, ... are taken for images of "
+        f"{some([name for name, _ in named])}, in this order. If they are not, give them the "
+        "cameras' names."
     )
     return counted
 
 
 def _videos_by_name(folder: Path) -> dict[str, Path]:
-    """Videos in a folder and in those inside, by their names without the ending."""
-    found = [*folder.resolve().glob("*"), *folder.resolve().glob("*/*")]
-    return {path.stem: path for path in found if path.suffix.lower() in videos.SUFFIXES}
+    """Videos in a folder and in those inside, by their names without the ending.
+
+    Those in the folder come before others, and videos of masks and the like do not count.
+    """
+    folder = folder.resolve()
+    inside = [p for p in sorted(folder.glob("*/*")) if not OTHER_KINDS.search(p.parent.name)]
+    found = [*inside, *sorted(folder.glob("*"))]
+    return {
+        path.stem: path
+        for path in found
+        if path.suffix.lower() in videos.SUFFIXES and not path.name.startswith(".")
+    }
 
 
 def _source(label: str, folder: Path, name: Any, named: Mapping[str, Path]) -> Path:

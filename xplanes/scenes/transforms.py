@@ -105,18 +105,35 @@ IGNORED = (
     *("n_extra_learnable_dims", "importance_sampling", "enable_ray_loading", "fix_premult"),
     *("colmap_im_id", "colmap_image_id", "camera_id", "cam_id", "component_id", "id", "name"),
     *("depth_file_path", "depth_path", "integer_depth_scale", "enable_depth_loading"),
-    *("normal_file_path", "depth_unit_scale_factor", "rotation", "render_aabb", "path"),
+    *(
+        "depth_integer_scale",
+        "depth_source",
+        "normal_file_path",
+        "depth_unit_scale_factor",
+        "rotation",
+        "render_aabb",
+        "path",
+    ),
     *("crop_width", "crop_height", "blur_score", "n_images", "fps", "num_frames"),
     *("camera", "camera_label", "camera_name", "cam_name", "camera_index", "camera_indices"),
     *("timestep_id", "timestep_indices", "timestep_index_original", "flame_param_path"),
 )
 """Keys of other programs without effect here."""
 
+TIMELESS = (
+    'Give every frame a "time", rename the images by their times, or, for a static scene, set '
+    "data.static=true."
+)
+"""How to give other times than the numbers in names."""
+
 BESIDE = {
     "ignored": ["dynamic_mask_{stem}.png"],
     "alpha": ["{stem}.alpha{suffix}", "{stem}{suffix}.alpha{suffix}"],
 }
 """Names of mask files beside an image, by their meaning."""
+
+UNSET = ("k1", "k2", "p1", "p2")
+"""Coefficients of lenses that agi2nerf writes as -1 if Metashape's file has none."""
 
 SYNONYMS = {"sx1": "s1", "sy1": "s3"}
 """COLMAP's names of a fisheye lens's prism coefficients."""
@@ -138,18 +155,26 @@ def time_span(contents: Iterable[Mapping[str, Any]]) -> tuple[float, float] | No
     return (min(times), max(times)) if times else None
 
 
-def numbers(contents: Iterable[Mapping[str, Any]]) -> dict[str, float]:
-    """The numbers in the names of all images of several transforms files, by name.
+def numbers(contents: Mapping[Path, Mapping[str, Any]]) -> dict[str, float]:
+    """The numbers in the names of all images of several transforms files, by their ``file_path``.
 
-    Empty if a frame has a time, or if names have no number that varies.
+    Images that are missing do not count: programs list cameras that were never rendered. Empty if
+    a frame has a time, or if names have no number that varies.
+
+    Args:
+        contents: Result of `readable`.
     """
-    contents = list(contents)
-    if time_span(contents) is not None:
+    images: dict[str, str] = {}
+    for path, content in contents.items():
+        folder = path.parent.resolve()
+        for entry in content["frames"]:
+            with suppress(SceneError):
+                image = _files_of("", folder, content, entry)[0]
+                images[entry["file_path"]] = image.relative_to(folder).as_posix()
+    if not images or time_span(contents.values()) is not None:
         return {}
-    entries = [entry for content in contents for entry in content["frames"]]
-    names = [name for entry in entries if isinstance(name := entry.get("file_path"), str)]
-    found = times_in_names(names, dynamic=True)
-    return dict(zip(names, found, strict=True)) if found else {}
+    found = times_in_names([*images.values()], dynamic=True, advice=TIMELESS)
+    return dict(zip(images, found, strict=True)) if found else {}
 
 
 def all_masks(contents: Mapping[Path, Mapping[str, Any]]) -> tuple[list[Path | None], str]:
@@ -654,6 +679,10 @@ def _lens(
                     "number, or be left out."
                 )
             found[SYNONYMS.get(key, key)] = float(value)
+    unset = [key for key in UNSET if found.get(key) == -1]
+    if len(unset) > 1:  # No lens has two coefficients of exactly -1.
+        warn(f"{where}: {', '.join(unset)} are -1, as agi2nerf writes it for none: taken for 0.")
+        found |= dict.fromkeys(unset, 0.0)
     if model == LensModel.FOV:
         omega = found.get("omega", 0.0)
         if not 0 < omega < math.pi:

@@ -39,6 +39,12 @@ CONSEQUENCES = {"axes": ("cut",), "scale": ("cut", "texels"), "astray": ("cut",)
 ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".xz", ".7z", ".rar")
 """Endings of archives."""
 
+STAMPED = "; programs write it for static scenes as well: data.static=true if nothing moves"
+"""What is said of times from "timestamp"."""
+
+NAMED = ("blender", "dnerf", "nerfstudio", "colmap", "llff")
+"""Formats in which data.static=false takes times from names."""
+
 NATIVE = "data.resolution=null"
 """The setting that reads images at their native size."""
 
@@ -381,7 +387,9 @@ def table(capture: Capture) -> str:
         markdown(["split", *splits], lines),
         "",
     ]
-    text += [f"{name:<7} {words}" for name, words in known["notes"].items()]
+    for name, words in known["notes"].items():
+        stamped = name == "times" and words.startswith('"timestamp"')
+        text.append(f"{name:<7} {words}{STAMPED if stamped else ''}")
     if known["video_frames"]:
         video = capture.scene.video
         plain = video is not None and video.is_opaque and capture.scene.is_surrounded
@@ -390,10 +398,15 @@ def table(capture: Capture) -> str:
     if known["static_reason"]:
         text.append(f"static  {known['static_reason']}")
     elif known["splits"]["train"]["timesteps"] == 1:
+        named = (
+            "; data.static=false takes the numbers in the names of images for times"
+            if known["format"] in NAMED
+            else ""
+        )
         text.append(
             "static  all training views have the same time, so nothing can move; if something "
-            'does, the files must give the times (in transforms files, "time" of each frame); '
-            "data.static=false takes the numbers in the names of images for times"
+            f'does, the files must give the times (in transforms files, "time" of each frame)'
+            f"{named}"
         )
     if (cube := known["cube"]) is not None:
         centre = ", ".join(f"{value:.3g}" for value in cube["centre"])

@@ -161,15 +161,15 @@ def _noise(model: XPlanesSettings, seed: int) -> Mapping[str, Tensor]:
 
 def _by_median(triplanes: Tensor, model: XPlanesSettings, method: Method) -> dict[str, object]:
     """Planes and sparse part where the static part is the median over time."""
-    options = method.decomposition
-    space = space_planes(triplanes, static="median", resolution=model.resolution)
+    options, texels = method.decomposition, model.coarse_texels()
+    space = space_planes(triplanes, static="median", resolution=texels)
     sparse = triplanes - triplanes.median(dim=0).values
     assert isinstance(model.time_resolution, int)
     time = time_planes(
         sparse,
         plane_set=model.plane_set,
         dynamic=options.dynamic,
-        resolution=model.texels_of_time,
+        resolution=model.time_texels or texels,
         time_resolution=model.time_resolution,
         noise=options.noise,
         generator=step_generator(method.seed, 0, Stream.NOISE),

@@ -1,6 +1,5 @@
 """Numbers of samples in training steps and in images."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,7 @@ from xplanes.rendering.sampler import Site
 from xplanes.scenes.frame import cube_frame
 from xplanes.streams import TrainingState
 
-STEPS_OF_A_RAY = {"training": 16, "smooth": 24, "pictures": 40}
+STEPS_OF_A_RAY = {"training": 16, "filled": 24, "pictures": 40}
 
 
 def fog(points, times):
@@ -41,12 +40,23 @@ def along_the_diagonal() -> dict[str, torch.Tensor]:
     }
 
 
-@pytest.mark.parametrize("surrounded", [False, True])
-def test_images_of_the_trained_field_have_samples_of_their_own(monkeypatch, surrounded):
-    sampling = sampler(fog, "model.sampler.samples=16", "model.sampler.render_samples=40")
-    sampling._training_renderer = replace(sampling._training_renderer, surrounded=surrounded)
-    soft = "smooth" if surrounded else "training"
-    for name, kind in (("", "training"), ("UNPRUNED", soft), ("HALF_EMPTY", "pictures")):
+class Surrounded:
+    """Fog in front of a learnt background."""
+
+    background = object()
+    __call__ = staticmethod(fog)
+
+
+@pytest.mark.parametrize(
+    ("field", "positions", "filled"),
+    [(fog, 50, "training"), (Surrounded(), 49, "training"), (Surrounded(), 50, "filled")],
+)
+def test_images_of_the_trained_field_have_samples_of_their_own(
+    monkeypatch, field, positions, filled
+):
+    changes = "model.sampler.samples=16", "model.sampler.render_samples=40"
+    sampling = sampler(field, *changes, positions=positions)
+    for name, kind in (("", "training"), ("UNPRUNED", filled), ("HALF_EMPTY", "pictures")):
         if name:
             monkeypatch.setattr(grid_renderer, name, 1.0)
         seen = sampling.renderer.render(fog, **along_the_diagonal())

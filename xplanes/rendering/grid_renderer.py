@@ -41,9 +41,13 @@ BINS, MOST_BINS = 8, 16
 UNPRUNED = 0.9
 """Share of occupied cells above which an image searches for empty space first."""
 
-HALF_EMPTY, SMOOTH = 0.4, 1.5
-"""Share of occupied cells above which a field is too smooth for images to gain from more samples
-than training batches have, but for some more with surroundings, in this proportion."""
+HALF_EMPTY = 0.4
+"""Share of occupied cells above which a field is too smooth for images to gain from many more
+samples than training batches have."""
+
+DETAILED, POSITIONS = 1.5, 50
+"""How many times the samples of training batches images have at most until then, in scenes with
+surroundings that are seen from at least this many camera positions."""
 
 SEARCHED_PER_RAY = 8
 """Cells per ray that an image searches for empty space at most, if nothing is pruned yet."""
@@ -225,8 +229,8 @@ class OccupancySettings(SamplerSettings):
     # along its side, from 128 to 256; 128 in scenes with surroundings.
     samples: Count | Literal["auto"]
     # Samples along the diagonal in evaluation and videos; as many as in training while two fifths
-    # of the cells are occupied, or one and a half times as many in scenes with surroundings while
-    # nine tenths are not.
+    # of the cells are occupied, or one and a half times as many while nine tenths are not in scenes
+    # with surroundings that are seen from at least 50 camera positions.
     render_samples: Count
     grid_resolution: Count  # Cells of the occupancy grid along each side.
     # Bins of the occupancy grid along time. auto: 8; one per timestep, up to 16, if four or more
@@ -323,7 +327,9 @@ class OccupancySettings(SamplerSettings):
         settings = (
             self.with_constant_background(site) if constant else self.with_learnt_background()
         )
-        return OccupancySampler(renderer, settings, site.samples_per_batch, fill_seconds)
+        detailed = not constant and (site.positions or 0) >= POSITIONS
+        filled = round(DETAILED * along) if detailed else along
+        return OccupancySampler(renderer, settings, site.samples_per_batch, fill_seconds, filled)
 
     def with_constant_background(self, site: Site) -> "OccupancySettings":
         """Settings for a constant background: sweeps scaled to the batch size, no losses of fog.
@@ -374,6 +380,8 @@ class OccupancySampler(Sampler):
         settings: Settings of the updates.
         most_samples: Maximum average number of samples per batch; None if unknown.
         fill_seconds: Seconds spent on filling the grid of an initialised field.
+        filled_samples: Samples along the diagonal for images of a field that fills much of the
+            cube; as many as in training when None.
     """
 
     def __init__(
@@ -382,9 +390,10 @@ class OccupancySampler(Sampler):
         settings: OccupancySettings,
         most_samples: int | None = None,
         fill_seconds: float = 0.0,
+        filled_samples: int | None = None,
     ) -> None:
         self.settings, self.grid, self.most_samples = settings, renderer.grid, most_samples
-        self.fill_seconds = fill_seconds
+        self.fill_seconds, self._filled_samples = fill_seconds, filled_samples or renderer.samples
         surrounded = max(settings.distortion, settings.border) > 0
         self._training_renderer = replace(
             renderer, surrounded=surrounded, thinning=settings.thinning
@@ -396,8 +405,7 @@ class OccupancySampler(Sampler):
     def renderer(self) -> GridRenderer:
         renderer, least = self._image_renderer, self._training_renderer.samples
         occupied = self.grid.occupied_fraction
-        soft = self._training_renderer.surrounded and occupied <= UNPRUNED
-        most = round(SMOOTH * least) if soft else least
+        most = least if occupied > UNPRUNED else self._filled_samples
         if renderer.samples > most and occupied > HALF_EMPTY:
             return replace(renderer, samples=most)
         return renderer

@@ -53,7 +53,7 @@ FINE_WARMUP = 100
 TEXELS_PER_PIXEL, TEXEL_STEP, MOST_TEXELS = 0.66, 32, 256
 """Fine planes with texels=auto: texels per image pixel, rounding step, and maximum of texels."""
 
-USUAL_TEXELS, MORE_TEXELS, LEAST_PIXELS, LEAST_POSITIONS = 64, 96, 480, 50
+USUAL_TEXELS, MORE_TEXELS, LEAST_PIXELS = 64, 96, 480
 """Space planes with resolution=auto: texels, and more texels where as many pixels cover the cube
 and as many camera positions show a moving scene with surroundings."""
 
@@ -191,7 +191,7 @@ class XPlanesSettings(ModelSettings):
             return self.resolution
         if site is None or not (site.surrounded and site.moves):
             return USUAL_TEXELS
-        many = (site.positions or 0) >= LEAST_POSITIONS and site.pixels >= LEAST_PIXELS
+        many = site.is_seen_from_many and site.pixels >= LEAST_PIXELS
         return MORE_TEXELS if many else USUAL_TEXELS
 
     def texels(self, site: Site) -> int:

@@ -45,9 +45,9 @@ HALF_EMPTY = 0.4
 """Share of occupied cells above which a field is too smooth for images to gain from many more
 samples than training batches have."""
 
-DETAILED, POSITIONS = 1.5, 50
+DETAILED = 1.5
 """How many times the samples of training batches images have at most until then, in scenes with
-surroundings that are seen from at least this many camera positions."""
+surroundings that are seen from many camera positions."""
 
 SEARCHED_PER_RAY = 8
 """Cells per ray that an image searches for empty space at most, if nothing is pruned yet."""
@@ -327,7 +327,7 @@ class OccupancySettings(SamplerSettings):
         settings = (
             self.with_constant_background(site) if constant else self.with_learnt_background()
         )
-        detailed = not constant and (site.positions or 0) >= POSITIONS
+        detailed = not constant and site.is_seen_from_many
         filled = round(DETAILED * along) if detailed else along
         return OccupancySampler(renderer, settings, site.samples_per_batch, fill_seconds, filled)
 

@@ -30,6 +30,9 @@ logger = logging.getLogger(__name__)
 VIEWS_PER_ROW = 4
 """Views that a timestep needs to have its own row of the time planes."""
 
+MANY_POSITIONS = 50
+"""Camera positions from which a field has more detail than what few cameras show."""
+
 Group = dict[str, Any]
 """A parameter group of the optimiser: ``params``, ``lr`` and ``name``."""
 
@@ -91,6 +94,11 @@ class Site:
     def moves(self) -> bool:
         """Whether the training views show more than one timestep."""
         return len(self.times.unique()) > 1
+
+    @property
+    def is_seen_from_many(self) -> bool:
+        """Whether the training cameras have many positions; false if these are unknown."""
+        return (self.positions or 0) >= MANY_POSITIONS
 
     @property
     def time_rows(self) -> int:

@@ -54,6 +54,7 @@ class ColmapSettings(CaptureSettings):
     """A capture registered with COLMAP."""
 
     files: ClassVar = "sparse/0 with cameras.bin and images.bin (or .txt), and images"
+    numbers_are_times: ClassVar = True
     more_splits: ClassVar = ", or name the folders of some cameras in data.test_cameras"
 
     # Folder of the COLMAP model; null: sparse/0 (or the largest beside it), sparse or

@@ -26,6 +26,7 @@ class BlenderSettings(SceneSettings):
     """A scene on disk in the format of D-NeRF or Blender."""
 
     files: ClassVar = "transforms_train.json"
+    numbers_are_times: ClassVar = True
     hint: ClassVar = (
         ", get the D-NeRF scenes with `xplanes download dnerf`, or take the built-in scene with "
         "data=demo"

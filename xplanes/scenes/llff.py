@@ -28,6 +28,7 @@ class LlffSettings(CaptureSettings):
     """A capture in the format of LLFF; static unless it has folders of a dynamic scene."""
 
     files: ClassVar = "poses_bounds.npy and a folder images with an image for each of its rows"
+    numbers_are_times: ClassVar = True
 
     @classmethod
     def recognises(cls, folder: Path) -> bool:

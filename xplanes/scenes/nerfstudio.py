@@ -21,6 +21,7 @@ class NerfstudioSettings(CaptureSettings):
     """A capture in the format of nerfstudio or instant-ngp."""
 
     files: ClassVar = "transforms.json"
+    numbers_are_times: ClassVar = True
     more_splits: ClassVar = ', or list "val_filenames" or "test_filenames" in the file'
 
     @classmethod

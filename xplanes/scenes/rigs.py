@@ -471,18 +471,17 @@ def _counted(model: SparseModel, recordings: Sequence[Path]) -> dict[str, list[P
     4DGaussians copies an image of each camera to these names, with the number of cam01 and the
     like. Without such numbers they are counted.
     """
-    named = sorted((camera_name(path), path) for path in recordings)
-    named.sort(key=lambda each: natural(each[0]))
-    numbers = [int(match[0]) for name, _ in named if (match := re.search(r"\d+$", name))]
-    if len(numbers) < len(named) or 0 in numbers:
-        numbers = range(1, len(named) + 1)
-    counted = {f"image{n}": [path] for n, (_, path) in zip(numbers, named, strict=True)}
+    named = {camera_name(path): path for path in recordings}
+    names = sorted(named, key=natural)
+    numbers = [int(match[0]) for name in names if (match := re.search(r"\d+$", name))]
+    if len(numbers) < len(names) or 0 in numbers:
+        numbers = range(1, len(names) + 1)
+    counted = {f"image{n}": [named[name]] for n, name in zip(numbers, names, strict=True)}
     if not {PurePosixPath(name).stem for name in model.names} <= {*counted}:
         return {}
     warn(
-        f"{model.source}: image1, image2, ... are taken for images of "
-        f"{some([name for name, _ in named])}, in this order. If they are not, give them the "
-        "cameras' names."
+        f"{model.source}: image1, image2, ... are taken for images of {some(names)}, in this "
+        "order. If they are not, give them the cameras' names."
     )
     return counted
 

@@ -136,6 +136,9 @@ class SceneSettings(Settings, ABC):
     hint: ClassVar[str] = ""
     """Further advice if there is no such scene."""
 
+    numbers_are_times: ClassVar[bool] = False
+    """Whether ``static=false`` takes the numbers in the images' names for times that are missing."""
+
     def check(self) -> None:
         if self.centre is not None and len(self.centre) != 3:
             raise ConfigError(f"centre={self.centre}: must be three world coordinates, [x,y,z]")

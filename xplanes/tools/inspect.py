@@ -42,9 +42,6 @@ ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".xz", ".7z", ".rar")
 STAMPED = "; programs write it for static scenes as well: data.static=true if nothing moves"
 """What is said of times from "timestamp"."""
 
-NAMED = ("blender", "dnerf", "nerfstudio", "colmap", "llff")
-"""Formats in which data.static=false takes times from names."""
-
 NATIVE = "data.resolution=null"
 """The setting that reads images at their native size."""
 
@@ -400,7 +397,7 @@ def table(capture: Capture) -> str:
     elif known["splits"]["train"]["timesteps"] == 1:
         named = (
             "; data.static=false takes the numbers in the names of images for times"
-            if known["format"] in NAMED
+            if capture.choice.scene.numbers_are_times
             else ""
         )
         text.append(

@@ -216,7 +216,8 @@ def _without_short(
         f"{folder}: {names} have fewer than {SHORT:.0%} of the {usual:g} frames of other cameras, "
         "and are left out. data.frames reads a range of the frames of all cameras."
     )
-    return [recording for recording in recordings if recording not in short]
+    lost = {recording.camera.name for recording in short}
+    return [recording for recording in recordings if recording.camera.name not in lost]
 
 
 def _split_cameras(

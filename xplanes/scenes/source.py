@@ -137,7 +137,7 @@ class SceneSettings(Settings, ABC):
     """Further advice if there is no such scene."""
 
     numbers_are_times: ClassVar[bool] = False
-    """Whether ``static=false`` takes the numbers in the images' names for times that are missing."""
+    """Whether ``static=false`` takes numbers in the images' names for times that are missing."""
 
     def check(self) -> None:
         if self.centre is not None and len(self.centre) != 3:

@@ -39,7 +39,7 @@ from xplanes.files import StorageError
 from xplanes.launch import SettingsCheck, prepare
 from xplanes.locks import alone_in, if_free, in_turn
 from xplanes.process import resume_command
-from xplanes.scenes.colmap import ColmapSettings
+from xplanes.readers.colmap import ColmapSettings
 
 SHORT = (*(text for text in SMALL if "max_steps" not in text), NO_CURVE)
 """Settings of a small run without its number of steps."""

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.captures import NerfiesFolder, save, write_rows, write_transforms
-from tests.scenes.test_formats_agree import (
+from tests.readers.test_formats_agree import (
     CAMERAS,
     FOCAL,
     FRAMES,

@@ -34,6 +34,10 @@ MOVED = {
     "xplanes.rendering.gaussians.renderer": "xplanes.baselines.gaussians.renderer",
     "xplanes.rendering.neus": "xplanes.baselines.tensor4d.neus",
     "xplanes.rendering.proposal": "xplanes.baselines.proposal",
+    **{
+        f"xplanes.scenes.{name}": f"xplanes.readers.{name}"
+        for name in ("colmap", "dnerf", "llff", "multicamera", "nerfies", "nerfstudio")
+    },
     "xplanes.scenes.demo.write": "xplanes.synthetic.demo.write",
 }
 """Old names of modules in runs and checkpoints of early 0.3, and their present names."""

@@ -84,6 +84,11 @@ def first_of(problems: Sequence[str]) -> str:
     return "\n".join([*problems[:SHOWN], *rest])
 
 
+def some(names: Sequence[str]) -> str:
+    """The first of many names, for messages."""
+    return f"{', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"
+
+
 def warn(text: str) -> None:
     """Warn about a capture."""
     warnings.warn(text, stacklevel=3)

@@ -15,8 +15,8 @@ import torch
 from tests.captures import save, settings
 from tests.refusals import assert_refused
 from xplanes.errors import SceneError
+from xplanes.readers.dnerf import BlenderSettings
 from xplanes.scenes.cameras import look_at
-from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.scenes.store import PixelFile, StoredImages
 
 ANGLE = 0.7

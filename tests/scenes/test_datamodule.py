@@ -11,10 +11,10 @@ from tests.balls import RAYS as WHITE
 from tests.balls import ball_scene
 from tests.scenes.common import same
 from xplanes.errors import ConfigError
+from xplanes.readers.listing import held_out_places
 from xplanes.scenes.batches import RayBatches
 from xplanes.scenes.datamodule import UNIFORM, SceneDataModule, spread_order
 from xplanes.scenes.frame import cube_frame, scene_frame
-from xplanes.scenes.listing import held_out_places
 
 FRAME = cube_frame(1.4, torch.zeros(3))
 RAYS = replace(WHITE, per_batch=8, background="random")

@@ -20,11 +20,11 @@ from tests.captures import save
 from tests.scenes.common import assert_even, drawn_pixels, numbered, same, stored
 from xplanes.errors import SceneError
 from xplanes.files import DAY, MARK, StorageError
+from xplanes.readers.images import Picture, final_sizes, native_sizes
+from xplanes.readers.images import read_images as read_sized
 from xplanes.scenes import store
 from xplanes.scenes.batches import AHEAD, RayBatches
 from xplanes.scenes.frame import cube_frame, scene_frame
-from xplanes.scenes.images import Picture, final_sizes, native_sizes
-from xplanes.scenes.images import read_images as read_sized
 from xplanes.scenes.lenses import Lenses, LensModel
 from xplanes.scenes.matte import silhouette_of
 from xplanes.scenes.silhouettes import may_hold

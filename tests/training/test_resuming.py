@@ -16,9 +16,9 @@ from tests.training.runs import UNSCORED, metrics, small_config, status
 from xplanes.errors import ConfigError
 from xplanes.files import read_rows
 from xplanes.process import resume_command
+from xplanes.readers.dnerf import BlenderSettings
 from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
-from xplanes.scenes.dnerf import BlenderSettings
 from xplanes.tools.runs import load_run
 from xplanes.training import module
 from xplanes.training.checkpoints import AtomicCheckpointIO, load_checkpoint
@@ -199,7 +199,7 @@ def test_a_missing_split_is_held_out_of_training_or_nothing_is_the_best(
         (folder / f"transforms_{split}.json").unlink()
     known = {field.name for field in fields(BlenderSettings)}
     data = {name: value for name, value in usual.items() if name in known}
-    data |= {"_target_": "xplanes.scenes.dnerf.BlenderSettings", "mask_use": "auto"}
+    data |= {"_target_": "xplanes.readers.dnerf.BlenderSettings", "mask_use": "auto"}
     data |= {"root": str(tmp_path / "scenes"), "scene": "few"}
     done = train(*FEW, "trainer.max_steps=1", "callbacks.evaluation.at=[0]", data=data)
     split = "val" if "test" in missing else "test"

@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from xplanes.errors import some
 from xplanes.scenes.cameras import project
-from xplanes.scenes.entries import some
 from xplanes.scenes.frame import Frame, axes_meet, backwards, optical_centre
 from xplanes.scenes.matte import silhouette_of
 from xplanes.scenes.silhouettes import count_in_squares

@@ -1,1 +1,1 @@
-"""Input data: cameras, scene files, procedural scenes and the ray batches drawn from them."""
+"""What was photographed: cameras, views, the frame of a scene, and ray batches."""

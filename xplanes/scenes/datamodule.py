@@ -18,8 +18,7 @@ from xplanes.errors import ConfigError, MissingSplitError
 from xplanes.files import read_json
 from xplanes.scenes.batches import Batch, Batches, DeviceBatches, RayBatches, RaySettings
 from xplanes.scenes.frame import Frame, scene_frame
-from xplanes.scenes.listing import held_out_places
-from xplanes.scenes.source import HELD_OUT, SceneSettings, may_hold_out
+from xplanes.scenes.source import HELD_OUT, SceneSettings, held_out_places, may_hold_out
 from xplanes.scenes.views import Scene, Views, spread
 
 UNIFORM = RaySettings(

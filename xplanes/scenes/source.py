@@ -1,28 +1,34 @@
-"""Base classes of data formats: common settings, splits, and static scenes."""
+"""The base class of data formats: common settings, held-out views, and static scenes."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, Literal, TypeVar
+from typing import ClassVar, Literal, Protocol, Self, TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from xplanes.errors import ConfigError, MissingSplitError, SceneError, warn
-from xplanes.scenes.entries import some, world_turn
-from xplanes.scenes.formats import is_image
+from xplanes.errors import ConfigError, MissingSplitError, SceneError, some, warn
 from xplanes.scenes.frame import CubeHints
-from xplanes.scenes.images import GREY
-from xplanes.scenes.listing import Listing, read_views
-from xplanes.scenes.masks import MASKS, MaskUse, chosen_use, survey
-from xplanes.scenes.videos import SUFFIXES as VIDEOS
 from xplanes.scenes.views import Scene, Views, joined, spread
 from xplanes.settings import Count, Location, Positive, Settings
 
-Part = TypeVar("Part", Listing, Views)
+
+class Timed(Protocol):
+    """What a split is before or after its images are read: images with times."""
+
+    @property
+    def times(self) -> Tensor: ...
+
+    def __len__(self) -> int: ...
+
+    def subset(self, indices: Sequence[int], /) -> Self: ...
+
+
+Part = TypeVar("Part", bound=Timed)
 
 SAME = 2
 """Largest difference of a static pixel between frames, in steps of 1/255."""
@@ -34,6 +40,23 @@ HELD_OUT = 8
 def may_hold_out(train: Views) -> bool:
     """Whether there are enough training views to hold some out."""
     return len(train) >= 2 * HELD_OUT
+
+
+def held_out_places(times: Sequence[float], every: int) -> list[int]:
+    """Evenly spaced indices of views to hold out, one per group of ``every`` views in time.
+
+    If several cameras observe each timestep, a fixed index within the groups could always select
+    the same camera, so the index varies from group to group.
+
+    Args:
+        times: Times of the views, in ascending order.
+        every: Size of the groups.
+    """
+    # Multiples of the golden ratio modulo 1 are evenly spread, too.
+    step = 0.5 * (math.sqrt(5) - 1) if 1 < len(set(times)) < len(times) else 0.0
+    groups = range(-(-len(times) // every))
+    places = (every * group + int(every * ((0.5 + step * group) % 1)) for group in groups)
+    return [place for place in places if place < len(times)]
 
 
 def frames_are_equal(video: Views) -> bool:
@@ -64,49 +87,6 @@ def as_static(scene: Scene, reason: str) -> Scene:
         lrm_views=None if scene.lrm_views is None else at_one_time(scene.lrm_views),
         static_reason=reason,
     )
-
-
-def warn_of_masks(folder: Path, images: Sequence[Path], advice: str = "") -> None:
-    """Warn about files and folders that seem to be masks, but are not read.
-
-    Args:
-        folder: The scene's folder.
-        images: Its images, without masks.
-        advice: What to do with masks; empty if they can be named.
-    """
-    folder, images = folder.resolve(), [path.resolve() for path in images]
-    places = {path.parent for path in images}
-    used = {*images, *places, *(parent for place in places for parent in place.parents)}
-    above = {place.parent for place in places if folder in place.parents}
-    found = sorted(
-        path
-        for place in {folder, *places, *above}
-        for path in place.iterdir()
-        if MASKS.search(path.name) and path not in used
-        if path.is_dir() or is_image(path) or (advice and path.suffix.lower() in VIDEOS)
-    )
-    if found:
-        names = some([path.as_posix().removeprefix(f"{folder.as_posix()}/") for path in found])
-        place = found[0] if found[0].is_dir() else found[0].parent
-        advice = advice or (
-            f"name their folder (data.masks={place.name}, of colmap and nerfies), or their files "
-            "(mask_path of the frames in transforms files)"
-        )
-        warn(f"{folder}: {names} is not read. If these are masks of the images, {advice}.")
-
-
-def warn_of_videos(folder: Path, images: Sequence[Path]) -> None:
-    """Warn about several videos in a capture's folder, or in one inside, but for its images."""
-    inside = [path for pattern in ("*", "*/*") for path in folder.glob(pattern)]
-    inside = [path for path in inside if path.suffix.lower() in VIDEOS and path.name[0] != "."]
-    found = sorted(path.name for path in inside)
-    if len(found) > 1:
-        alike = {path.stem for path in images} <= {path.stem for path in inside}
-        when = "Each image has the name of one" if alike else "If they are of several fixed cameras"
-        warn(
-            f"{folder}: {some(found)}: {len(found)} videos are not read, only images are. {when}: "
-            "read them with data=multicamera."
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,63 +212,6 @@ class SceneSettings(Settings, ABC):
             found[split] = part
         return found
 
-    def scene_of(
-        self,
-        parts: Mapping[str, Listing],
-        mask_use: MaskUse,
-        masks: tuple[Sequence[Path | None], str],
-        up: str = "",
-        video: Listing | None = None,
-        points: Tensor | None = None,
-    ) -> Scene:
-        """The scene of listed images, which are decoded here.
-
-        Args:
-            parts: The images of each split.
-            mask_use: Meaning of the black parts of masks.
-            masks: Masks of the whole capture, from which their meaning is determined for all
-                splits, and what their source says of it, as in `Listing`.
-            up: Description of the up direction; empty if the files' world is unchanged.
-            video: Frames of a fixed camera, if there are some.
-            points: World points on surfaces, if known. [N, 3]
-
-        Raises:
-            SceneError: If an image or a mask cannot be used, or with mask_use lrm if no training
-                image has a mask.
-        """
-        listings, (files, told) = list(parts.values()), masks
-        notes = {"times": source} if (source := listings[0].time_source) else {}
-        use, kind, lrm_views = mask_use, GREY, None
-        if mask_use == "lrm" and "train" in parts and not any(parts["train"].masks):
-            raise SceneError(
-                "data.mask_use=lrm: no training image has a mask file. Add masks, or set it to "
-                "auto."
-            )
-        if any(files):
-            kind = survey(files, told == "ignored")
-            use, notes["masks"] = chosen_use(mask_use, kind, str(self.folder), told)
-
-        def read(part: Listing) -> Views:
-            return read_views(part, self.resolution, self.image_cache, use == "ignore", kind)
-
-        if use == "lrm":
-            lrm_views = read(parts["train"]) if "train" in parts else None
-            parts = {split: replace(part, masks=()) for split, part in parts.items()}
-        splits = {split: read(part) for split, part in parts.items()}
-        if not up:
-            poses = torch.cat([listing.camera_to_world for listing in listings])
-            up = world_turn(poses, (), False)[1]
-            if world_turn(poses, (), None)[0] is not None:
-                warn(f"{self.folder}: up is {up}. If the scene lies on its side, rotate the poses.")
-        return Scene(
-            self.folder.resolve().name,
-            splits,
-            video=None if video is None else read(video),
-            points=points,
-            lrm_views=lrm_views,
-            notes={**notes, "up": up},
-        )
-
     def read(self, splits: Sequence[str] | None = None) -> Scene:
         """Read the scene as these settings specify.
 
@@ -331,65 +254,3 @@ class SceneSettings(Settings, ABC):
             "images are scored, which says little about other views."
         )
         return replace(scene, splits={**scene.splits, "val": train})
-
-
-@dataclass(frozen=True, kw_only=True)
-class CaptureSettings(SceneSettings, ABC):
-    """Base class of formats with held-out images and masks."""
-
-    # If the capture lists no splits, every n-th image is held out as val, in order of time and file
-    # name; never the first or last.
-    eval_every: Count
-    # Use of masked-out pixels. alpha: empty space; ignore: neither trained on nor scored; auto:
-    # alpha if masks look like silhouettes, else ignore; lrm: only the LRM's input is masked.
-    mask_use: MaskUse
-    # Rotate the world so that the cameras' mean up vector becomes its z axis. null: if that is more
-    # than 60 degrees from it.
-    orient: bool | None
-
-    more_splits: ClassVar[str] = ""
-    """Further ways to define a split, for messages."""
-
-    def capture(
-        self,
-        listing: Listing,
-        places: Mapping[str, Sequence[int]],
-        splits: Sequence[str],
-        source: Path,
-        points: np.ndarray | None = None,
-        up: Tensor | None = None,
-    ) -> Scene:
-        """The requested splits of a capture.
-
-        Args:
-            listing: All images.
-            places: Indices of each split's images in the list.
-            splits: Names of splits.
-            source: Source of the splits, for messages.
-            points: World points on surfaces. [N, 3]
-            up: The world's up vector, if the files give one. float64 [3]
-
-        Raises:
-            MissingSplitError: If a split has no images.
-            SceneError: If an image or a mask cannot be used.
-        """
-        for split in splits:
-            if not places.get(split):
-                names = ", ".join(name for name, part in places.items() if part)
-                raise MissingSplitError(
-                    f"{source} has no {split} split. Splits of this capture: {names or 'none'}. "
-                    f"Choose another data.eval_split, lower data.eval_every={self.eval_every} (the "
-                    f"first and the last image are never held out){self.more_splits}."
-                )
-        if not any(listing.masks):
-            warn_of_masks(self.folder, listing.paths)
-        warn_of_videos(self.folder, listing.paths)
-        turn, words = world_turn(listing.camera_to_world, listing.paths, self.orient, up)
-        found = None if points is None else torch.from_numpy(points - np.array(listing.origin))
-        if turn is not None:
-            listing = listing.turned(turn)
-            found = None if found is None else found @ turn.T
-        parts = self.thinned({split: listing.subset(places[split]) for split in splits})
-        found = None if found is None else found.float()
-        masks = listing.masks, listing.mask_meaning
-        return self.scene_of(parts, self.mask_use, masks, words, points=found)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from xplanes.errors import SceneError
-from xplanes.scenes.entries import checked_pose, is_number, is_positive, read_object, short
+from xplanes.readers.entries import checked_pose, is_number, is_positive, read_object, short
 from xplanes.scenes.views import Views
 
 logger = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ import torch
 
 from xplanes.components import build, class_of, plugins
 from xplanes.config import compose_plain, group_options, quoted, settings_and_paths
-from xplanes.errors import ConfigError, SceneError
+from xplanes.errors import ConfigError, SceneError, some
 from xplanes.evaluation.findings import (
     Finding,
     calibrations,
@@ -25,7 +25,6 @@ from xplanes.models.base import ModelSettings
 from xplanes.process import train_command
 from xplanes.rendering.sampler import Site
 from xplanes.scenes.cameras import image_plane
-from xplanes.scenes.entries import some
 from xplanes.scenes.frame import Frame, pixels_across
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.source import SceneSettings

@@ -19,12 +19,12 @@ from xplanes.preparation.encode import encode
 from xplanes.preparation.reconstruct import ImageLRMSettings, picture_crop
 from xplanes.preparation.sequence import TriplaneSequence, save_triplanes
 from xplanes.process import say
+from xplanes.readers.formats import ENDINGS, is_image
+from xplanes.readers.images import load_images
 from xplanes.rendering.grid_renderer import DIAGONAL, GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.cameras import PosedCamera, camera_around
-from xplanes.scenes.formats import ENDINGS, is_image
 from xplanes.scenes.frame import cube_frame
-from xplanes.scenes.images import load_images
 from xplanes.streams import Stream, step_generator
 
 FRAMES, FPS, SIDE = 48, 16, 224  # Of the video; pixels per side.

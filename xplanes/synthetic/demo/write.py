@@ -22,8 +22,8 @@ from torch import Tensor
 from xplanes.backend import threads
 from xplanes.errors import ConfigError, SceneError
 from xplanes.files import DAY
-from xplanes.scenes.dnerf import read_scene
-from xplanes.scenes.images import load_images
+from xplanes.readers.dnerf import read_scene
+from xplanes.readers.images import load_images
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
 from xplanes.settings import Count, Steps

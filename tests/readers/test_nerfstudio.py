@@ -15,12 +15,12 @@ from tests.balls import ball_views, surrounding
 from tests.captures import save, settings
 from tests.scenes.common import Transforms, assert_same_rays, keys_of, refused, told
 from xplanes.errors import MissingSplitError
+from xplanes.readers.nerfstudio import NerfstudioSettings
 from xplanes.scenes import store
 from xplanes.scenes.batches import RayBatches, ViewBatches, ViewSettings
 from xplanes.scenes.datamodule import UNIFORM, whole_view
 from xplanes.scenes.frame import scene_frame
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
-from xplanes.scenes.nerfstudio import NerfstudioSettings
 from xplanes.scenes.views import joined
 from xplanes.streams import step_generator
 from xplanes.training.scores import score_image

@@ -13,7 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from xplanes.errors import SceneError, warn
-from xplanes.scenes.formats import SIXTEEN_BIT_MODES, mask_misfit, open_image, read_header
+from xplanes.readers.formats import SIXTEEN_BIT_MODES, mask_misfit, open_image, read_header
 
 logger = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ import numpy as np
 from xplanes.errors import SceneError, warn
 from xplanes.files import stand_in
 from xplanes.optional import require
-from xplanes.scenes.images import Size
+from xplanes.readers.images import Size
 
 SUFFIXES = """.mp4 .mov .m4v .mkv .webm .avi .mpg .mpeg .ts .mts .m2ts .3gp .wmv""".split()
 """Suffixes of video files."""

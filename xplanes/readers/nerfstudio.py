@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from xplanes.errors import BrokenFrameError, SceneError, first_of, warn
-from xplanes.scenes.entries import image_path, short, spelt
-from xplanes.scenes.listing import Listing, held_out
-from xplanes.scenes.rigs import is_rig
-from xplanes.scenes.source import CaptureSettings
-from xplanes.scenes.transforms import listing_of, numbers, read_frames, stated_up
+from xplanes.readers.capture import CaptureSettings
+from xplanes.readers.entries import image_path, short, spelt
+from xplanes.readers.listing import Listing, held_out
+from xplanes.readers.rigs import is_rig
+from xplanes.readers.transforms import listing_of, numbers, read_frames, stated_up
 from xplanes.scenes.views import Scene
 
 SPLITS = ("train", "val", "test")

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import ClassVar
 
 from xplanes.errors import MissingSplitError, SceneError, warn
-from xplanes.scenes.entries import SPLIT_FOLDERS, spelt
-from xplanes.scenes.listing import Listing
-from xplanes.scenes.masks import MaskUse
-from xplanes.scenes.source import SceneSettings, warn_of_masks
-from xplanes.scenes.transforms import (
+from xplanes.readers.capture import scene_of, warn_of_masks
+from xplanes.readers.entries import SPLIT_FOLDERS, spelt
+from xplanes.readers.listing import Listing
+from xplanes.readers.masks import MaskUse
+from xplanes.readers.transforms import (
     all_masks,
     listing_of,
     numbers,
@@ -18,6 +18,7 @@ from xplanes.scenes.transforms import (
     readable,
     time_span,
 )
+from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene
 
 
@@ -77,7 +78,7 @@ def read_scene(settings: SceneSettings, splits: Sequence[str], mask_use: MaskUse
     video = _list_video(folder, span, numbered)
     _require_times(folder, listed if video is None else {**listed, "video": video})
     # Masks mean the same whichever parts are read.
-    return settings.scene_of(listed, mask_use, all_masks(contents), video=video)
+    return scene_of(settings, listed, mask_use, all_masks(contents), video=video)
 
 
 def _listed(

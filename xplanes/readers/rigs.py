@@ -18,24 +18,23 @@ from typing import Any
 
 import numpy as np
 
-from xplanes.errors import BrokenFrameError, SceneError, warn
+from xplanes.errors import BrokenFrameError, SceneError, some, warn
 from xplanes.files import natural
-from xplanes.scenes import videos
-from xplanes.scenes.calibrations import FILES, find_calibration, read_calibrations
-from xplanes.scenes.colmap_model import MODELS, SparseModel, find_model, image_count, read_model
-from xplanes.scenes.entries import (
+from xplanes.readers import videos
+from xplanes.readers.calibrations import FILES, find_calibration, read_calibrations
+from xplanes.readers.colmap_model import MODELS, SparseModel, find_model, image_count, read_model
+from xplanes.readers.entries import (
     checked_pose,
     is_positive,
     paths_inside,
     read_array,
-    some,
     spelt,
     usable,
 )
-from xplanes.scenes.formats import is_image
-from xplanes.scenes.listing import Calibration
-from xplanes.scenes.masks import MASKS
-from xplanes.scenes.transforms import (
+from xplanes.readers.formats import is_image
+from xplanes.readers.listing import Calibration
+from xplanes.readers.masks import MASKS
+from xplanes.readers.transforms import (
     TIMES,
     TRANSPARENT,
     read_calibration,

@@ -15,8 +15,8 @@ from tests.lens_oracle import direction
 from tests.scenes.common import refused as refused_by
 from tests.scenes.common import told
 from xplanes.errors import MissingSplitError
+from xplanes.readers.nerfies import NerfiesSettings
 from xplanes.scenes.cameras import project
-from xplanes.scenes.nerfies import NerfiesSettings
 
 CENTRE, SCALE = np.array([0.5, -1, 2]), 0.25
 

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings
+from tests.readers.test_colmap import OPENCV
 from tests.scenes.common import refused, told
-from tests.scenes.test_colmap import OPENCV
+from xplanes.readers.multicamera import MultiCameraSettings
 from xplanes.scenes.lenses import COEFFICIENTS
-from xplanes.scenes.multicamera import MultiCameraSettings
 
 POSES = poses(4)
 K = np.array([[OPENCV[0], 0, OPENCV[2]], [0, OPENCV[1], OPENCV[3]], [0, 0, 1]])

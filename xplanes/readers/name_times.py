@@ -8,9 +8,8 @@ from itertools import pairwise
 from pathlib import PurePosixPath
 from statistics import median
 
-from xplanes.errors import warn
+from xplanes.errors import some, warn
 from xplanes.files import natural
-from xplanes.scenes.entries import some
 
 OTHER_TIMES = (
     r"Set data.time_pattern to a regular expression for the names, such as frame_(\d+), data.times "

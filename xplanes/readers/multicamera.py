@@ -20,13 +20,15 @@ from xplanes.errors import (
     MissingSplitError,
     SceneError,
     refuse_all,
+    some,
     warn,
 )
 from xplanes.files import natural
-from xplanes.scenes import store, videos
-from xplanes.scenes.entries import origin_near, some, unit_times, usable, world_turn
-from xplanes.scenes.formats import ENDINGS, read_header
-from xplanes.scenes.images import (
+from xplanes.readers import videos
+from xplanes.readers.capture import warn_of_masks
+from xplanes.readers.entries import origin_near, unit_times, usable, world_turn
+from xplanes.readers.formats import ENDINGS, read_header
+from xplanes.readers.images import (
     Picture,
     Size,
     cleared,
@@ -35,8 +37,8 @@ from xplanes.scenes.images import (
     shared_size,
     shrink,
 )
-from xplanes.scenes.listing import final_intrinsics, misshapen
-from xplanes.scenes.name_times import (
+from xplanes.readers.listing import final_intrinsics, misshapen
+from xplanes.readers.name_times import (
     CAMERA,
     DATE,
     Number,
@@ -44,7 +46,7 @@ from xplanes.scenes.name_times import (
     times_of_clocks,
     timesteps_of,
 )
-from xplanes.scenes.rigs import (
+from xplanes.readers.rigs import (
     POSES,
     Camera,
     are_registered,
@@ -54,8 +56,9 @@ from xplanes.scenes.rigs import (
     read_cameras,
     recordings_of_rows,
 )
-from xplanes.scenes.source import SceneSettings, warn_of_masks
-from xplanes.scenes.transforms import stated_up
+from xplanes.readers.transforms import stated_up
+from xplanes.scenes import store
+from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
 
 logger = logging.getLogger(__name__)

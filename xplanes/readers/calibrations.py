@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from xplanes.errors import SceneError, warn
-from xplanes.scenes.entries import checked_pose, decoded, parsed, reading, short, some, usable
-from xplanes.scenes.listing import Calibration
-from xplanes.scenes.transforms import read_calibration
+from xplanes.errors import SceneError, some, warn
+from xplanes.readers.entries import checked_pose, decoded, parsed, reading, short, usable
+from xplanes.readers.listing import Calibration
+from xplanes.readers.transforms import read_calibration
 
 FILES = ("extri.yml", "models.json", "calibration_*.json", "*/extri.yml", "*/calibration_*.json")
 """Files of EasyMocap (with intri.yml beside it), of immersive videos and of CMU Panoptic."""

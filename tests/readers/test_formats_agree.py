@@ -13,11 +13,11 @@ import torch
 from tests.balls import ball_views, surrounding, swinging
 from tests.captures import save, settings, write_colmap
 from tests.scenes.common import assert_same_rays, refused
-from xplanes.scenes.colmap import ColmapSettings
-from xplanes.scenes.dnerf import BlenderSettings
-from xplanes.scenes.multicamera import MultiCameraSettings
-from xplanes.scenes.nerfies import NerfiesSettings
-from xplanes.scenes.nerfstudio import NerfstudioSettings
+from xplanes.readers.colmap import ColmapSettings
+from xplanes.readers.dnerf import BlenderSettings
+from xplanes.readers.multicamera import MultiCameraSettings
+from xplanes.readers.nerfies import NerfiesSettings
+from xplanes.readers.nerfstudio import NerfstudioSettings
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
 

@@ -7,14 +7,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from xplanes.scenes.colmap import ColmapSettings
-from xplanes.scenes.entries import read_array, unit_times
-from xplanes.scenes.formats import is_image
-from xplanes.scenes.images import native_sizes, width_rank
-from xplanes.scenes.listing import Listing, held_out, time_source
-from xplanes.scenes.name_times import times_in_names
-from xplanes.scenes.rigs import POSES, STATIC, is_dynamic, read_poses_bounds, recordings_of_cameras
-from xplanes.scenes.source import CaptureSettings
+from xplanes.readers.capture import CaptureSettings
+from xplanes.readers.colmap import ColmapSettings
+from xplanes.readers.entries import read_array, unit_times
+from xplanes.readers.formats import is_image
+from xplanes.readers.images import native_sizes, width_rank
+from xplanes.readers.listing import Listing, held_out, time_source
+from xplanes.readers.name_times import times_in_names
+from xplanes.readers.rigs import POSES, STATIC, is_dynamic, read_poses_bounds, recordings_of_cameras
 from xplanes.scenes.views import Scene
 
 OTHER_TIMES = (

@@ -13,11 +13,11 @@ from xplanes import RadianceModule
 from xplanes.errors import ConfigError, LRMError, SceneError
 from xplanes.lrm.checkpoint import read_weights
 from xplanes.preparation.sequence import load_triplanes
-from xplanes.scenes.colmap import ColmapSettings
-from xplanes.scenes.colmap_model import read_model
-from xplanes.scenes.entries import read_object
-from xplanes.scenes.formats import orientation
-from xplanes.scenes.images import load_images, native_sizes
+from xplanes.readers.colmap import ColmapSettings
+from xplanes.readers.colmap_model import read_model
+from xplanes.readers.entries import read_object
+from xplanes.readers.formats import orientation
+from xplanes.readers.images import load_images, native_sizes
 from xplanes.training.checkpoints import load_checkpoint
 
 POINTER = (

@@ -26,8 +26,8 @@ from xplanes.errors import (
     warn,
 )
 from xplanes.files import stand_in
+from xplanes.readers.formats import ENDINGS, is_image, orientation
 from xplanes.scenes.cameras import upright
-from xplanes.scenes.formats import ENDINGS, is_image, orientation
 
 logger = logging.getLogger(__name__)
 
@@ -559,8 +559,3 @@ def short(value: Any) -> str:
     """A value read from a file, for messages."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def some(names: Sequence[str]) -> str:
-    """The first of many names, for messages."""
-    return f"{', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"

@@ -8,8 +8,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from xplanes.errors import BrokenFrameError, SceneError, warn
-from xplanes.scenes.entries import (
+from xplanes.errors import BrokenFrameError, SceneError, some, warn
+from xplanes.readers.capture import CaptureSettings
+from xplanes.readers.entries import (
     checked_number,
     checked_pose,
     image_path,
@@ -18,14 +19,12 @@ from xplanes.scenes.entries import (
     read_array,
     read_object,
     short,
-    some,
     unit_times,
     usable,
 )
-from xplanes.scenes.formats import ENDINGS
-from xplanes.scenes.images import native_sizes, width_rank
-from xplanes.scenes.listing import Calibration, Listing, held_out, time_source
-from xplanes.scenes.source import CaptureSettings
+from xplanes.readers.formats import ENDINGS
+from xplanes.readers.images import native_sizes, width_rank
+from xplanes.readers.listing import Calibration, Listing, held_out, time_source
 from xplanes.scenes.views import Scene
 from xplanes.settings import Location
 

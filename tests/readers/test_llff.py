@@ -6,9 +6,9 @@ import torch
 
 from tests.captures import HEIGHT, WIDTH, picture, poses, save, settings, write_colmap, write_rows
 from tests.scenes.common import refused, told
-from xplanes.scenes.colmap import ColmapSettings
-from xplanes.scenes.llff import LlffSettings
-from xplanes.scenes.multicamera import MultiCameraSettings
+from xplanes.readers.colmap import ColmapSettings
+from xplanes.readers.llff import LlffSettings
+from xplanes.readers.multicamera import MultiCameraSettings
 
 COUNT = 10
 

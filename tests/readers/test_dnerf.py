@@ -17,9 +17,9 @@ from tests.scenes.common import ANGLE, SceneFolder, pose, refused, rgba, told
 from tests.training.runs import changed
 from xplanes.components import build
 from xplanes.errors import MissingSplitError
+from xplanes.readers.dnerf import BlenderSettings
+from xplanes.readers.images import load_images, load_premultiplied
 from xplanes.scenes.cameras import focal_length
-from xplanes.scenes.dnerf import BlenderSettings
-from xplanes.scenes.images import load_images, load_premultiplied
 from xplanes.scenes.lenses import COEFFICIENTS
 from xplanes.scenes.source import SceneSettings
 

@@ -4,8 +4,8 @@ import warnings
 
 import pytest
 
-from xplanes.scenes.entries import unit_times
-from xplanes.scenes.name_times import times_in_names
+from xplanes.readers.entries import unit_times
+from xplanes.readers.name_times import times_in_names
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import ClassVar
 
-from xplanes.errors import ConfigError, MissingSplitError, SceneError, warn
+from xplanes.errors import ConfigError, MissingSplitError, SceneError, some, warn
 from xplanes.files import natural
-from xplanes.scenes.colmap_model import (
+from xplanes.readers.capture import CaptureSettings
+from xplanes.readers.colmap_model import (
     MODELS,
     SparseModel,
     find_model,
@@ -21,22 +22,20 @@ from xplanes.scenes.colmap_model import (
     models_inside,
     read_model,
 )
-from xplanes.scenes.entries import (
+from xplanes.readers.entries import (
     decoded,
     image_path,
     mask_files,
     number_in,
     short,
-    some,
     spelt,
     unit_times,
     usable,
 )
-from xplanes.scenes.formats import is_image
-from xplanes.scenes.listing import Listing, held_out, time_source
-from xplanes.scenes.name_times import OTHER_TIMES, times_in_names
-from xplanes.scenes.rigs import POSES, STATIC, are_registered, is_dynamic, recordings_of_cameras
-from xplanes.scenes.source import CaptureSettings
+from xplanes.readers.formats import is_image
+from xplanes.readers.listing import Listing, held_out, time_source
+from xplanes.readers.name_times import OTHER_TIMES, times_in_names
+from xplanes.readers.rigs import POSES, STATIC, are_registered, is_dynamic, recordings_of_cameras
 from xplanes.scenes.views import Scene
 from xplanes.settings import Location
 

@@ -21,11 +21,11 @@ from tests.scenes.common import refused, told
 from tests.training.runs import changed
 from xplanes.components import build
 from xplanes.errors import ConfigError, MissingSplitError
+from xplanes.readers.colmap import ColmapSettings
+from xplanes.readers.colmap_model import LENSES, read_model
+from xplanes.readers.entries import origin_near
 from xplanes.scenes.cameras import cast_rays
-from xplanes.scenes.colmap import ColmapSettings
-from xplanes.scenes.colmap_model import LENSES, read_model
 from xplanes.scenes.datamodule import SceneDataModule
-from xplanes.scenes.entries import origin_near
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses
 from xplanes.scenes.source import SceneSettings
 

@@ -22,14 +22,14 @@ from tests.training.runs import changed
 from xplanes.components import build
 from xplanes.errors import ConfigError, MissingSplitError, SceneError
 from xplanes.optional import MissingExtraError
+from xplanes.readers import videos as recordings
+from xplanes.readers.colmap import ColmapSettings
+from xplanes.readers.listing import Calibration
+from xplanes.readers.llff import LlffSettings
+from xplanes.readers.multicamera import MultiCameraSettings, Recording, _are_stamped
+from xplanes.readers.nerfstudio import NerfstudioSettings
+from xplanes.readers.rigs import Camera, read_cameras, recordings_of_cameras
 from xplanes.scenes import store
-from xplanes.scenes import videos as recordings
-from xplanes.scenes.colmap import ColmapSettings
-from xplanes.scenes.listing import Calibration
-from xplanes.scenes.llff import LlffSettings
-from xplanes.scenes.multicamera import MultiCameraSettings, Recording, _are_stamped
-from xplanes.scenes.nerfstudio import NerfstudioSettings
-from xplanes.scenes.rigs import Camera, read_cameras, recordings_of_cameras
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
 

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from xplanes.errors import BrokenFrameError, MissingSplitError, SceneError, warn
-from xplanes.scenes.cameras import focal_length
-from xplanes.scenes.entries import (
+from xplanes.readers.entries import (
     checked_number,
     checked_pose,
     image_path,
@@ -28,10 +27,11 @@ from xplanes.scenes.entries import (
     unit_times,
     usable,
 )
-from xplanes.scenes.formats import read_header
+from xplanes.readers.formats import read_header
+from xplanes.readers.listing import Calibration, Listing, time_source
+from xplanes.readers.name_times import times_in_names
+from xplanes.scenes.cameras import focal_length
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
-from xplanes.scenes.listing import Calibration, Listing, time_source
-from xplanes.scenes.name_times import times_in_names
 
 logger = logging.getLogger(__name__)
 

@@ -11,9 +11,9 @@ from PIL import Image
 from torch import Tensor
 
 from xplanes.errors import SceneError, all_of, warn
+from xplanes.readers.formats import SIXTEEN_BIT_MODES, open_image, read_header
+from xplanes.readers.masks import MaskKind, read_mask
 from xplanes.scenes import store
-from xplanes.scenes.formats import SIXTEEN_BIT_MODES, open_image, read_header
-from xplanes.scenes.masks import MaskKind, read_mask
 from xplanes.scenes.store import Size
 
 EIGHT_BIT_MODES = ("RGBA", "RGB", "CMYK", "LA", "L", "P", "PA", "1")

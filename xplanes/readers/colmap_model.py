@@ -18,9 +18,9 @@ from typing import BinaryIO, TypeVar
 import numpy as np
 
 from xplanes.errors import BrokenFrameError, SceneError
-from xplanes.scenes.entries import decoded, number_in, reading, short, usable
+from xplanes.readers.entries import decoded, number_in, reading, short, usable
+from xplanes.readers.listing import Calibration
 from xplanes.scenes.lenses import COEFFICIENTS, LensModel
-from xplanes.scenes.listing import Calibration
 
 LENSES: dict[str, tuple[int, LensModel, str]] = {
     "SIMPLE_PINHOLE": (0, LensModel.PERSPECTIVE, "f cx cy"),

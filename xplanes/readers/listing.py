@@ -10,12 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from xplanes.errors import MissingSplitError, SceneError, refuse_all, warn
-from xplanes.scenes.entries import origin_near, refuse_repeats, some
-from xplanes.scenes.formats import UNTURN, mask_misfit, orientation
-from xplanes.scenes.images import GREY, Picture, Size, final_sizes, native_sizes, read_images
+from xplanes.errors import MissingSplitError, SceneError, refuse_all, some, warn
+from xplanes.readers.entries import origin_near, refuse_repeats
+from xplanes.readers.formats import UNTURN, mask_misfit, orientation
+from xplanes.readers.images import GREY, Picture, Size, final_sizes, native_sizes, read_images
+from xplanes.readers.masks import MaskKind, ignored_pixels
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
-from xplanes.scenes.masks import MaskKind, ignored_pixels
+from xplanes.scenes.source import held_out_places
 from xplanes.scenes.views import Intrinsics, Views, spread
 
 SHORTEST, LONGEST = 0.02, 1e5
@@ -216,23 +217,6 @@ def time_source(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
     shown = dict.fromkeys(spread(min(len(files), 3), len(files)))
     examples = ", ".join(f"{files[rank]} -> {known[rank]}" for rank in shown)
     return f"{origin}, from {first} to {last}: {examples}"
-
-
-def held_out_places(times: Sequence[float], every: int) -> list[int]:
-    """Evenly spaced indices of views to hold out, one per group of ``every`` views in time.
-
-    If several cameras observe each timestep, a fixed index within the groups could always select
-    the same camera, so the index varies from group to group.
-
-    Args:
-        times: Times of the views, in ascending order.
-        every: Size of the groups.
-    """
-    # Multiples of the golden ratio modulo 1 are evenly spread, too.
-    step = 0.5 * (math.sqrt(5) - 1) if 1 < len(set(times)) < len(times) else 0.0
-    groups = range(-(-len(times) // every))
-    places = (every * group + int(every * ((0.5 + step * group) % 1)) for group in groups)
-    return [place for place in places if place < len(times)]
 
 
 def held_out(listing: Listing, every: int) -> dict[str, list[int]]:

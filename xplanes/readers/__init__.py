@@ -1,0 +1,1 @@
+"""Readers of data formats: files of other programs to scenes. The core does not import them."""

@@ -14,6 +14,7 @@ from tests.balls import ball_views, swinging
 from tests.baselines.runs import KPLANES, PROPOSAL, TINEUVOX
 from tests.training.runs import same_state, small_config, train_quietly
 from xplanes import RadianceModule, SceneDataModule
+from xplanes.backend import waves
 from xplanes.baselines.proposal import spaced, unspaced
 from xplanes.evaluation import render
 from xplanes.evaluation.render import FRAMES, RunVideo, write_run_video
@@ -124,6 +125,21 @@ def test_total_variation_of_space_planes_depends_on_what_they_show(kind, overrid
     if "model.fine=null" in overrides:
         smooth.remove("model.fine.coarse_variation=0.2")
     assert built(kind, *smooth, *overrides).model.total_variation == weight
+
+
+def test_the_background_is_smoother_where_few_cameras_look():
+    def pull(views):
+        module = built("world", f"model.loss.variation_views={views}", "model.loss.every=1")
+        planes = module.field.background.planes
+        with torch.no_grad():
+            planes.copy_(waves(planes.device, *planes.shape))
+        for parameter in module.field.parameters():
+            parameter.grad = torch.zeros_like(parameter)
+        module.model.regularise(module.state)
+        return planes.grad
+
+    positions = built("world").site.positions
+    torch.testing.assert_close(pull(4 * positions), 2 * pull("null"))
 
 
 def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():

@@ -105,9 +105,9 @@ class BackgroundSettings(Settings):
         error = background_colour(background, origins, directions) - usual
         return {"unseen": UNSEEN_EVERY * self.unseen * error.square().mean()}
 
-    def regularise(self, background: Background, every: int = 1) -> None:
-        """Add the planes' total variation gradient, times ``every``, the steps between calls."""
+    def regularise(self, background: Background, factor: float = 1.0) -> None:
+        """Add the gradient of the planes' total variation, times its weight and a factor."""
         planes = background.planes
         if planes.grad is not None and self.total_variation:
-            weight = self.total_variation * every
+            weight = self.total_variation * factor
             add_total_variation_gradient(planes.grad, planes, (1, 2), weight)

@@ -107,8 +107,8 @@ class XPlanesLoss(Settings):
     # Replaces `model.loss.total_variation` in moving scenes if a background is learnt.
     total_variation_with_background: Weight
     # Number of camera positions for which the weights of the coarse space planes are meant. With
-    # fewer they are larger in inverse proportion, up to tenfold, unless an LRM initialises the
-    # field; null: never.
+    # fewer they are larger in inverse proportion, up to tenfold, and that of the background by the
+    # square root of this, unless an LRM initialises the field; null: never.
     variation_views: Count | None
     # Factor on the three weights of time planes below if a background is learnt.
     time_factor_with_background: Share
@@ -307,7 +307,9 @@ class XPlanesModel(Model):
             self.total_variation = self.weights.total_variation_with_background
         elif self.fine_settings is not None:
             self.total_variation = self.fine_settings.coarse_variation
-        self.total_variation *= self._few_views(site)
+        smoother = self._few_views(site)
+        self.total_variation *= smoother
+        self.background_factor = smoother**0.5
         views = len(site.times)
         steps = self.weights.initial_steps
         self.fade = None if steps is None else steps / views / site.batch_scale
@@ -401,7 +403,7 @@ class XPlanesModel(Model):
         if state.step % every or field.space.grad is None:
             return
         if field.background is not None and self.settings.background is not None:
-            self.settings.background.regularise(field.background, every)
+            self.settings.background.regularise(field.background, every * self.background_factor)
         fading = self._fading(state.step)
         if not fading:
             self._initial, self.product = [], None  # Frees memory: both are large.
@@ -439,7 +441,7 @@ class XPlanesModel(Model):
             for name, (plane, dims, weight) in self._variation().items()
         }
         if (background := field.background) is not None and (options := self.settings.background):
-            variation = options.total_variation
+            variation = options.total_variation * self.background_factor
             terms["background"] = (variation, lambda: total_variation(background.planes, (1, 2)))
         if self._initial:
             terms["initialisation"] = (fading * self.initial_weight, self._distance)

@@ -14,7 +14,7 @@ import numpy as np
 from xplanes.errors import SceneError, some, warn
 from xplanes.readers.entries import checked_pose, decoded, parsed, reading, short, usable
 from xplanes.readers.listing import Calibration
-from xplanes.readers.transforms import read_calibration
+from xplanes.readers.transforms_lenses import read_calibration
 
 FILES = ("extri.yml", "models.json", "calibration_*.json", "*/extri.yml", "*/calibration_*.json")
 """Files of EasyMocap (with intri.yml beside it), of immersive videos and of CMU Panoptic."""

@@ -37,10 +37,10 @@ from xplanes.readers.masks import MASKS
 from xplanes.readers.transforms import (
     TIMES,
     TRANSPARENT,
-    read_calibration,
     read_frames,
     warn_of_unknown,
 )
+from xplanes.readers.transforms_lenses import read_calibration
 
 POSES = "poses_bounds.npy"
 TRANSFORMS = "transforms.json"

@@ -137,7 +137,7 @@ def _way_out(
     if module.site.initialised and not added and not (rendered and broken):
         largest = max(float(p.detach().abs().max()) for p in module.field.parameters())
         return (
-            "No step was done yet, so the initialisation is to blame (largest value "
+            "No step was done yet, so the initialisation is the cause (largest value "
             f"{largest:.3g}): set lrm=none, or use another one"
         )
     checked = " and ".join([type(module.field).__name__, *added])

@@ -1,4 +1,4 @@
-"""The configuration files, composed by Hydra. Must import fast, hence without torch."""
+"""The configuration files, composed by Hydra. Imports fast, without torch."""
 
 import difflib
 import re

@@ -48,7 +48,7 @@ class Stream(IntEnum):
     TIME_NOISE = 1_000_357
     """Noise on the input times of the Gaussians' deformation network."""
     SIGHT = 1_000_381
-    """Rays along which surface points of a field are searched."""
+    """Rays on which surface points of a field are found."""
     SPARSITY = 1_000_403
     """Points at which the sparsity prior is evaluated; processes add their rank."""
     THINNING = 1_000_427

@@ -68,7 +68,7 @@ class Place:
         device: Device of the computation.
         devices: Number of processes that share the run.
         say: Prints a line before a slow stage.
-        hints: What is known of the scene's cube.
+        hints: Information about the scene's cube.
     """
 
     scene: Scene

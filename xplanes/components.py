@@ -40,7 +40,7 @@ MOVED = {
     },
     "xplanes.scenes.demo.write": "xplanes.synthetic.demo.write",
 }
-"""Old names of modules in runs and checkpoints of early 0.3, and their present names."""
+"""Old names of modules in runs and checkpoints of early 0.3, and their current names."""
 
 _plugins: ContextVar[tuple[str, ...]] = ContextVar("plugins", default=())
 

@@ -94,7 +94,7 @@ def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
 
 
 _prepared: dict[str, Any] = {}
-"""Jobs that `SettingsCheck` has prepared, by run directory, so that they are prepared once."""
+"""Jobs that `SettingsCheck` has prepared, by run directory, for use in the job."""
 
 
 class SettingsCheck(Callback):
@@ -408,13 +408,13 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
 
 
 def _gives_way(line: str, changed: set[str]) -> bool:
-    """Whether a run's override is left out, because a new one sets its key or needs its group."""
+    """Whether a run's override is dropped, because a new one sets its key or needs its group."""
     key = line.lstrip("+~").partition("=")[0]  # Also of one that deletes (~key).
     return key in changed or (line[0] == "~" and any(e.startswith(f"{key}.") for e in changed))
 
 
 def _require_present_names(arguments: Sequence[str], *, several: bool) -> None:
-    """Refuse options of earlier versions, and name those that replace them."""
+    """Refuse options of earlier versions, and name their replacements."""
     former, now = [], []
     for text in arguments:
         key, value = text.partition("=")[::2]

@@ -42,7 +42,7 @@ class Stream(IntEnum):
     BACKGROUND = 1_000_289
     """Initial values of the field behind the cube."""
     VIEWS = 1_000_303
-    """Order of the training views, where a batch is a whole view."""
+    """Order of the training views, for batches of one whole view."""
     SPLITTING = 1_000_333
     """Positions of the halves of split Gaussians."""
     TIME_NOISE = 1_000_357

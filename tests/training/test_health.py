@@ -196,7 +196,7 @@ NOT_FINITE += r"finite: correct losses\.mine or omit it{}"
         ("gradient", False, 99, r"step 0 on.*of XPlanes and losses\.mine"),
         ("gradient", True, None, r"step 0 on.*initialisation is the cause.*lrm=none"),
         ("bias", True, None, r"initialisation is the cause.*set lrm=none"),
-        ("bias", False, None, r"No step was done yet: check the values and gradients of XPlanes"),
+        ("bias", False, None, r"No step .*completed: check the values and gradients of XPlanes"),
         ("nothing", False, 0, NOT_FINITE.format(0, "$")),
         ("nothing", False, 7, NOT_FINITE.format(7, "; resume=")),
     ],

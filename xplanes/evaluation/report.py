@@ -270,7 +270,7 @@ def log_hparams(trainer: Trainer, experiment: Experiment, metrics: dict[str, Any
 
 
 def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
-    """The lines printed at the end: scores, time, paths, and what to do next."""
+    """The lines printed at the end: scores, time, paths, and suggested next commands."""
     seconds, skipped = metrics["seconds"], metrics["skipped"]
     limits, more = experiment.trainer, ""
     if 0 <= limits.get("max_steps", -1) <= 2 * metrics["step"]:

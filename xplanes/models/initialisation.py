@@ -22,7 +22,7 @@ NO_TIME: dict[str, float] = dict.fromkeys(STAGES, 0.0)
 """Seconds of each stage, all 0."""
 
 NOTHING_SKIPPED = {"frames": 0.0, "directions": 0.0}
-"""Shares of the work that was left out, all 0."""
+"""Shares of work that was skipped, all 0."""
 
 
 @dataclass(frozen=True)

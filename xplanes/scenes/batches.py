@@ -62,7 +62,7 @@ class Batches(ABC):
     Attributes:
         views: Training views.
         rays: Number of rays per batch.
-        skipped: Share of the rays that go to other pixels than with uniform sampling.
+        skipped: Share of the rays that would go to other pixels with uniform sampling.
     """
 
     views: Views

@@ -44,7 +44,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 def _require_data(checkpoint: Mapping[str, Any]) -> None:
-    """Refuse a state that could be written but not read, such as numpy numbers in a callback.
+    """Refuse a state that could be saved but not loaded, such as numpy numbers in a callback.
 
     Raises:
         ConfigError: With the name of the part that contains it.

@@ -97,7 +97,7 @@ class RadianceModule(LightningModule):
         self.rays = 0
         """Number of rays in the next batch; 0 for whole views."""
         self.restarts = 0
-        """How often the field was re-initialised, see `restart`."""
+        """Number of times the field was re-initialised, see `restart`."""
         self.advice: str | None = None
         """Advice if the loss is not finite; the model's own when None."""
         self.between_updates = True
@@ -483,7 +483,7 @@ class RadianceModule(LightningModule):
         means = {f"{tag}/{name}": value for name, value in mean_scores(self.scores).items()}
         self.tally.last |= means
         if self.trainer.state.fn == TrainerFn.FITTING:
-            # Lightning's own count is one less, and does not continue in a resumed run.
+            # Lightning's own count is one less, and restarts in a resumed run.
             means["step"] = float(self.trainer.global_step)
         # All processes already have the means of all views; sync_dist avoids Lightning's warning.
         self.log_dict(means, batch_size=1, sync_dist=self.trainer.world_size > 1)
@@ -493,7 +493,7 @@ class RadianceModule(LightningModule):
     def agree(self) -> None:
         """Copy the sampler's buffers from the first process to all others.
 
-        Each has observed only its own rays; afterwards all score and save the same field.
+        Each has observed only its own rays; with equal buffers all score and save the same field.
         """
         if self._trainer is None or self._trainer.world_size == 1:
             return

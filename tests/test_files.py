@@ -89,9 +89,9 @@ def test_other_problems_are_not_the_disk_s(tmp_path):
 
 def test_a_file_in_the_place_of_a_folder_is_named_and_looking_for_one_makes_nothing(tmp_path):
     (tmp_path / "outputs").write_text("")
-    with pytest.raises(StorageError, match=r"outputs/run/a\.txt.*file stands where a folder"):
+    with pytest.raises(StorageError, match=r"outputs/run/a\.txt.*file is in the place of a folder"):
         write_text(tmp_path / "outputs" / "run" / "a.txt", "")
-    with pytest.raises(StorageError, match=r"outputs/run cannot.*file stands where a folder"):
+    with pytest.raises(StorageError, match=r"outputs/run cannot.*file is in the place of a folder"):
         require_writable(tmp_path / "outputs" / "run")
     require_writable(tmp_path / "new" / "run")
     assert listed(tmp_path) == ["outputs"]

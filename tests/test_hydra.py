@@ -342,7 +342,7 @@ def test_a_run_that_keeps_nothing_tells_of_a_busy_machine_and_offers_nothing(
     shown = capsys.readouterr().out
     assert "scoring: 1 of 2 views" in shown
     assert "scoring: 3 of 3 views" in shown
-    assert "warning  training got 0.3 s of CPU time a second: other programs" in shown
+    assert "warning  training got 0.3 s of CPU time per second: other programs" in shown
     for words in ("last.ckpt", "resume=", "xplanes render", "tensorboard"):
         assert words not in shown
 

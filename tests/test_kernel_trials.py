@@ -128,7 +128,7 @@ def test_a_gpu_that_is_lost_in_a_trial_is_not_asked_again(work, monkeypatch):
     what, module, name, outcome = work
     monkeypatch.setattr(module, name, broken)
     monkeypatch.setattr(backend, "synchronize", broken)
-    words = rf"stopped answering.*{re.escape(what)}.*illegal memory.*XPLANES_GPU_KERNELS=0"
+    words = rf"stopped responding.*{re.escape(what)}.*illegal memory.*XPLANES_GPU_KERNELS=0"
     with pytest.raises(DeviceError, match=words):
         outcome()
 

@@ -326,7 +326,7 @@ def test_a_checkpoint_of_another_version_is_refused_with_its_number(fitted, tmp_
     for version, words in (("0.1.7", r"xplanes 0\.1\.7"), (None, r"xplanes 0\.2 or older")):
         content.pop("xplanes", None)
         torch.save(content | ({"xplanes": version} if version else {}), tmp_path / "old.ckpt")
-        with pytest.raises(ConfigError, match=rf"{words}, whose settings are not those of"):
+        with pytest.raises(ConfigError, match=rf"{words}, whose settings differ from"):
             RadianceModule.load_from_checkpoint(tmp_path / "old.ckpt")
 
 

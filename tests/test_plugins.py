@@ -236,7 +236,7 @@ GROUPS = (
     ([GROUP] * 2, "two groups have the name mlp"),
     (
         [GROUP | {"learning_rate": 1}],
-        "Adam takes no 'learning_rate', which the group mlp has; it takes lr, betas",
+        "the group mlp has 'learning_rate', which Adam does not accept; it accepts lr, betas",
     ),
     ([GROUP], "no group has layers.0.weight of MLPField, which would never be trained; add it"),
 )

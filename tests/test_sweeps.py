@@ -215,7 +215,7 @@ def looked_ahead(*overrides: str) -> str:
 
 def test_a_sweep_is_run_with_the_flag(tmp_path):
     done = train("sweep=table1", "model=kplanes", cwd=tmp_path, code=1)
-    assert done.stderr.startswith("error: a sweep is many runs: ")
+    assert done.stderr.startswith("error: a sweep has many runs: ")
     assert done.stderr.endswith(" -m sweep=table1 model=kplanes\n")
     assert not list(tmp_path.iterdir())
 

@@ -269,7 +269,7 @@ def test_a_job_in_its_own_folder_finds_the_scene_of_the_command(scenes, tmp_path
     assert "metrics.json  checkpoints/last.ckpt" in said
     record = (run / ".hydra" / "overrides.yaml").read_bytes()
     refused = inside.train(*given, *place, "seed=1", cwd=tmp_path, code=1)
-    assert "holds a run already (finished)" in refused.stderr
+    assert "already holds a run (finished)" in refused.stderr
     assert (run / ".hydra" / "overrides.yaml").read_bytes() == record
 
 

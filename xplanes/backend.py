@@ -63,7 +63,7 @@ CONSEQUENCES = {
     "triton": "PyTorch computes the same on the GPU, more slowly. "
     "To install it: `pip install --upgrade triton` (PyTorch for CUDA on Linux includes it).",
 }
-"""What follows if a package is missing, and the remedy."""
+"""Effect of a missing package, and the remedy."""
 
 
 @functools.cache
@@ -128,7 +128,7 @@ def gpu_kernels(tensor: Tensor) -> bool:
 
 
 def in_group() -> bool:
-    """Whether this process trains together with others, so that they must agree."""
+    """Whether this process trains together with others, which must stay consistent."""
     return torch.distributed.is_available() and torch.distributed.is_initialized()
 
 
@@ -182,7 +182,8 @@ def proven(
         logger.warning(
             "the Triton kernels for %s are not used: %s. PyTorch computes the same, more slowly; "
             "XPLANES_GPU_KERNELS=0 hides this message.",
-            *(what, reason),
+            what,
+            reason,
         )
         _refused.add(what)
         return False
@@ -195,7 +196,7 @@ def _require_alive(device: torch.device, what: str, reason: str) -> None:
         synchronize(device)
     except Exception as error:
         raise DeviceError(
-            f"{device}: the GPU stopped answering in a trial of the Triton kernels for {what} "
+            f"{device}: the GPU stopped responding in a trial of the Triton kernels for {what} "
             f"({reason}). Start again with XPLANES_GPU_KERNELS=0, which disables them"
         ) from error
 

@@ -122,7 +122,7 @@ COMMANDS = {
         {
             "run": option("the run directory", metavar="RUN"),
             "overrides": option(
-                "what changes, and options of Hydra", nargs="*", metavar="KEY=VALUE"
+                "changed settings, and options of Hydra", nargs="*", metavar="KEY=VALUE"
             ),
         },
     ),

@@ -40,7 +40,7 @@ MOVED = {
     },
     "xplanes.scenes.demo.write": "xplanes.synthetic.demo.write",
 }
-"""Old names of modules in runs and checkpoints of early 0.3, and their present names."""
+"""Old names of modules in runs and checkpoints of early 0.3, and their current names."""
 
 _plugins: ContextVar[tuple[str, ...]] = ContextVar("plugins", default=())
 
@@ -109,7 +109,7 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
             if isinstance(value, Mapping) and "_target_" in value:
                 raise ConfigError(
                     f"{name}._target_={value['_target_']}: {cls.__name__} takes plain values here; "
-                    "derive a class that makes this one, and name it instead (plugins)"
+                    "name a class of your own that builds this object (plugins)"
                 )
         if cls.__module__.startswith("xplanes."):
             check_arguments(cls.__init__, arguments)
@@ -169,8 +169,8 @@ def class_of(target: Any, kind: type, key: str) -> type:
     allowed = (*TRUSTED, *_plugins.get())
     if not any(name == root or name.startswith(f"{root}.") for root in allowed):
         raise ConfigError(
-            f"{key}={name}: only classes of {', '.join(allowed)} may stand here; name a module of "
-            "your own with plugins=[MODULE], or --plugin MODULE for commands that read a run"
+            f"{key}={name}: only classes of {', '.join(allowed)} are allowed here; name a module "
+            "of your own with plugins=[MODULE], or --plugin MODULE for commands that read a run"
         )
     module, _, attribute = name.rpartition(".")
     module = MOVED.get(module, module)

@@ -1,4 +1,4 @@
-"""The configuration files, composed by Hydra. Must import fast, hence without torch."""
+"""The configuration files, composed by Hydra. Imports fast, without torch."""
 
 import difflib
 import re
@@ -65,7 +65,7 @@ def compose_plain(name: str | None, overrides: Sequence[str]) -> dict[str, Any]:
     for override in overrides:
         if not isinstance(override, str):
             raise ConfigError(
-                f"compose({override!r}): takes settings one by one, as "
+                f"compose({override!r}): pass each setting as one string, as in "
                 'compose("model=nine_planes", "lrm=none")'
             )
     with _hydra(name, overrides):
@@ -186,7 +186,7 @@ def with_names(override: str, *, several: bool = False) -> str:
     if "(" in value and re.fullmatch(r"(choice|range|interval|glob|sort|shuffle)\(.*\)", value):
         return override
     if "," in value and not several and key.lstrip("+~") == "data.scene":
-        return override  # Hydra's own error says that a list of scenes needs --multirun.
+        return override  # Hydra's own error says that several scenes need --multirun.
     parts = VALUE.findall(f"{value},") if several else [value]
     parts = [part if _is_quoted(part) else quoted(at_home(part)) for part in parts]
     return f"{key}={','.join(parts)}"
@@ -255,7 +255,7 @@ def near_names(overrides: Sequence[str], name: str | None = "train") -> str:
     if key is None:
         return ""
     if options := _options_with(key, groups):
-        return f"{key} belongs to {' and '.join(options)}, which is not chosen"
+        return f"{key} belongs to {' and '.join(options)}, which is not selected"
     prefix, _, last = key.rpartition(".")
     if last in ELSEWHERE:
         return f"Did you mean {ELSEWHERE[last].format(keys[key])}?"

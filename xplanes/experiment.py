@@ -1,7 +1,7 @@
 """A whole run: its method, data, trainer, callbacks and logger, from a configuration.
 
-Lightning, whose import takes longer than that of everything else, is imported only to build the
-Trainer: until then wrong settings of the method and the data are refused in half the time.
+Lightning is slow to import, so only `build_trainer` imports it: invalid settings of the method and
+the data are refused in half the time.
 """
 
 import inspect
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 OWNERS = {
     "callbacks": "the group callbacks",
-    "logger": "logger=none, or another of its group,",
+    "logger": "logger=none, or another logger,",
     "default_root_dir": "hydra.run.dir",
 }
 """Arguments of the Trainer that cannot be set directly, and what to set instead."""
@@ -162,8 +162,8 @@ def _logger(name: str, node: Mapping[str, Any], run: Path) -> "Logger":
     cls = class_of(node.get("_target_"), Logger, f"{key}._target_")
     taken = inspect.signature(cls).parameters
     open_ended = any(each.kind is each.VAR_KEYWORD for each in taken.values())
-    place = {"save_dir": str(run)} if open_ended or "save_dir" in taken else {}
-    logger = build(node, Logger, key, **{k: v for k, v in place.items() if k not in node})
+    saves = (open_ended or "save_dir" in taken) and "save_dir" not in node
+    logger = build(node, Logger, key, **({"save_dir": str(run)} if saves else {}))
     if isinstance(logger, TensorBoardLogger):
         from torch.utils.tensorboard import SummaryWriter
 

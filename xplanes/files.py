@@ -52,7 +52,7 @@ def storage_errors(path: Path | None = None) -> Iterator[None]:
 
 _FREE = "Free some space, or choose a folder on another disk; existing files are intact"
 _OPEN = "Choose a folder that can be written"
-_IN_THE_WAY = "A file stands where a folder should be: choose another folder"
+_IN_THE_WAY = "A file is in the place of a folder: choose another folder"
 _WAYS_OUT = {
     errno.ENOSPC: _FREE,
     errno.EDQUOT: _FREE,
@@ -62,7 +62,7 @@ _WAYS_OUT = {
     errno.EPERM: _OPEN,
     errno.ENOTDIR: _IN_THE_WAY,
     errno.EEXIST: _IN_THE_WAY,
-    errno.EIO: "The disk or its connection fails; choose a folder on another disk",
+    errno.EIO: "The disk or its connection is failing; choose a folder on another disk",
 }
 
 _ONLY_WRITING = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
@@ -134,7 +134,7 @@ def require_empty(folder: Path) -> None:
     if folder.is_file():
         raise ConfigError(f"{folder} is a file: name a folder")
     if folder.is_dir() and any(folder.iterdir()):
-        raise ConfigError(f"{folder} holds files already: empty it, or name another with --out")
+        raise ConfigError(f"{folder} already contains files: empty it, or name another with --out")
 
 
 @contextmanager

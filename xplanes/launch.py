@@ -94,7 +94,7 @@ def train(arguments: Sequence[str], words: Sequence[str] = ()) -> None:
 
 
 _prepared: dict[str, Any] = {}
-"""Jobs that `SettingsCheck` has prepared, by run directory, so that they are prepared once."""
+"""Jobs that `SettingsCheck` has prepared, by run directory, for use in the job."""
 
 
 class SettingsCheck(Callback):
@@ -107,7 +107,7 @@ class SettingsCheck(Callback):
         if config.hydra.runtime.choices.get("sweep") and config.resume is None:
             task: Any = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
             given = shlex.join(text for text in task if key_and_value(text)[0] != "resume")
-            sys.exit(f"error: a sweep is many runs: {train_command()} -m {given}")
+            sys.exit(f"error: a sweep has many runs: {train_command()} -m {given}")
         names = [str(name) for name in config if name != "hydra"]
         HydraConfig.instance().set_config(config)  # As Hydra does for the job, for ${hydra:...}.
         try:
@@ -128,7 +128,7 @@ class SettingsCheck(Callback):
             # Fails here if a setting that names the run directory is missing.
             folder = config.hydra.run.dir
             _prepared[folder] = prepare(experiment, Path(folder).absolute())
-            # Hydra would write over the record of a run that is there.
+            # Otherwise Hydra would overwrite the record of an existing run.
             if config.resume is None and "LOCAL_RANK" not in os.environ:
                 claim(Path(folder), resume=False)
         except KNOWN_ERRORS as error:
@@ -193,7 +193,7 @@ def _job(config: DictConfig) -> float:
     except KeyboardInterrupt:
         if sweep:
             place = shlex.quote(f"hydra.sweep.dir={settings.sweep.dir}")
-            print(f"the whole sweep: the same command with {place} resume=auto")
+            print(f"to resume the whole sweep, repeat the command with {place} resume=auto")
         sys.exit(130)
 
 
@@ -235,7 +235,7 @@ def prepare(arguments: list[str]) -> list[str]:
     values = {key: unquoted(value) for key, value in map(key_and_value, arguments) if key}
     for text in arguments:
         if (key := key_and_value(text)[0]).isalpha() and text[0] == "+" and (CONF / key).is_dir():
-            raise ConfigError(f"{text}: the group is there already; write {text.lstrip('+')}")
+            raise ConfigError(f"{text}: the group is already set; write {text.lstrip('+')}")
     for key, value in values.items():
         if value in ("null", "None") and (CONF / key).is_dir():
             known = ", ".join(sorted(path.stem for path in (CONF / key).glob("*.yaml")))
@@ -252,7 +252,7 @@ def prepare(arguments: list[str]) -> list[str]:
         own = [a for a in arguments if not a.startswith("resume=")]
         found = Path(folder) if folder else _latest(own)
         if found is None or not (found / "run.json").is_file():
-            print("resume=auto: no unfinished run with these settings, so a new one begins")
+            print("resume=auto: no unfinished run with these settings; starting a new one")
             return [*own, "resume=null"]
         resume = str(found)
     if several:
@@ -268,8 +268,7 @@ def prepare(arguments: list[str]) -> list[str]:
 def _with_searchpath(arguments: list[str]) -> list[str]:
     """Write ``--config-dir`` as ``hydra.searchpath``, which is kept for a resumed run.
 
-    Left as it is beside ``--config-name``: Hydra looks for that file before it reads the search
-    path.
+    Not with ``--config-name``: Hydra looks for that file before it reads the search path.
     """
     folder, kept, words = "", [], iter(arguments)
     for word in words:
@@ -382,8 +381,8 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
     text = path.read_text(encoding="utf-8")
     if text and not text.endswith("\n"):
         raise ConfigError(
-            f"{path} is damaged: its last line is cut off. Mend it from {run / 'config.yaml'}, "
-            "one key=value a line"
+            f"{path} is damaged: its last line is cut off. Repair it from {run / 'config.yaml'}, "
+            "one key=value per line"
         )
     new = [a for a in arguments if not a.startswith(("resume=", "hydra.run.dir="))]
     changed = {key for key, _ in map(key_and_value, new) if key}
@@ -409,13 +408,13 @@ def _resumed(run: Path, arguments: list[str]) -> list[str]:
 
 
 def _gives_way(line: str, changed: set[str]) -> bool:
-    """Whether a run's override is left out, because a new one sets its key or needs its group."""
+    """Whether a run's override is dropped, because a new one sets its key or needs its group."""
     key = line.lstrip("+~").partition("=")[0]  # Also of one that deletes (~key).
     return key in changed or (line[0] == "~" and any(e.startswith(f"{key}.") for e in changed))
 
 
 def _require_present_names(arguments: Sequence[str], *, several: bool) -> None:
-    """Refuse options of earlier versions, and name those that replace them."""
+    """Refuse options of earlier versions, and name their replacements."""
     former, now = [], []
     for text in arguments:
         key, value = text.partition("=")[::2]
@@ -443,7 +442,7 @@ def _require_version(run: Path) -> None:
         return
     if version.split(".")[:2] != __version__.split(".")[:2]:
         raise ConfigError(
-            f"resume={run}: it was made by xplanes {version}, whose settings are not those of "
+            f"resume={run}: it was made by xplanes {version}, whose settings differ from "
             f"{__version__}; continue it with that version, or start a new run in another folder"
         )
 

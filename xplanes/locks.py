@@ -37,7 +37,7 @@ def in_turn(path: Path | None) -> Iterator[bool]:
     try:
         lock.acquire(timeout=0)
     except Timeout:
-        logger.warning("%s: another process is making it; waiting", path.with_suffix(""))
+        logger.warning("waiting for another process that is making %s", path.with_suffix(""))
         lock.acquire()
     except _UNLOCKABLE as problem:
         logger.warning("%s cannot be locked (%s): several processes may make it", path, problem)

@@ -43,7 +43,7 @@ from xplanes.training.record import (
 logger = logging.getLogger(__name__)
 
 KNOWN_ERRORS = (XPlanesError, MisconfigurationException)
-"""Errors reported by their message alone; the traceback is written to train.log only."""
+"""Errors reported by their message alone; the traceback goes to train.log only."""
 
 
 @dataclass(frozen=True)

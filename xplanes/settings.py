@@ -1,7 +1,7 @@
 """Typed settings: dataclasses that check types, ranges and choices when they are built.
 
-Each component of a run has such a class, which YAML files name as ``_target_``. Must import fast,
-hence without torch and Hydra.
+Each component of a run has such a class, which YAML files name as ``_target_``. Imports fast,
+without torch and Hydra.
 """
 
 import difflib

@@ -42,13 +42,13 @@ class Stream(IntEnum):
     BACKGROUND = 1_000_289
     """Initial values of the field behind the cube."""
     VIEWS = 1_000_303
-    """Order of the training views, where a batch is a whole view."""
+    """Order of the training views, for batches of one whole view."""
     SPLITTING = 1_000_333
     """Positions of the halves of split Gaussians."""
     TIME_NOISE = 1_000_357
     """Noise on the input times of the Gaussians' deformation network."""
     SIGHT = 1_000_381
-    """Rays along which surface points of a field are searched."""
+    """Rays on which surface points of a field are found."""
     SPARSITY = 1_000_403
     """Points at which the sparsity prior is evaluated; processes add their rank."""
     THINNING = 1_000_427

@@ -104,17 +104,13 @@ def _require_one_sweep(hydra: Mapping[str, Any], found: Sequence[Sequence[str]])
     names = dict.fromkeys(text for job in found for text in job if text.startswith("sweep="))
     if len(names) > 1:
         commands = "; ".join(f"{train_command()} -m {name}" for name in names)
-        raise ConfigError(
-            f"{', '.join(names)}: one sweep at a time, as each has its own runs: {commands}"
-        )
+        raise ConfigError(f"{', '.join(names)}: run one sweep at a time: {commands}")
     sweep, sweeper = hydra["runtime"]["choices"].get("sweep"), hydra["sweeper"]
     if sweep and SMALL in hydra["overrides"]["task"] and not sweeper.get("demo"):
         raise ConfigError(f"{SMALL}: sweep={sweep} has no small version; leave it out")
     if not found:
         rows = "; ".join(map(str, sweeper["rows"]))
-        raise ConfigError(
-            f"no row of the sweep has the settings of the command line; its rows: {rows}"
-        )
+        raise ConfigError(f"no row of the sweep matches the command line; its rows: {rows}")
 
 
 def _read(job: DictConfig) -> "Experiment | None":

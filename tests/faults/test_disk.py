@@ -130,6 +130,6 @@ def test_read_only(tally, nursery, shared, whole, tmp_path):
     (tmp_path / "file").write_text("kept")
     with pytest.raises(StorageError) as caught:
         prepare([f"hydra.run.dir={tmp_path / 'file' / 'run'}"])
-    tally.said(str(caught.value), "file stands where a folder should be")
+    tally.said(str(caught.value), "file is in the place of a folder")
     assert (tmp_path / "file").read_text() == "kept"
     tally.recovered()

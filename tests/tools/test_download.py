@@ -294,7 +294,7 @@ def test_full_disk(tmp_path, server, monkeypatch):
 def test_a_disk_that_refuses_is_said_in_words(tmp_path, server, monkeypatch):
     (tmp_path / "file").write_text("")
     for root in (tmp_path / "file", tmp_path / "file" / "deeper"):
-        with pytest.raises(StorageError, match="A file stands where a folder should be"):
+        with pytest.raises(StorageError, match="A file is in the place of a folder"):
             download(root, server)
 
     def full(line: str) -> None:

@@ -317,7 +317,7 @@ def test_the_command_exports_a_run(trained_run, tmp_path, capsys):
     assert len(mesh.faces) > 100
     assert mesh.is_watertight
     assert main(["export", str(trained_run), "--what", "planes", "--out", str(out)]) == 1
-    assert "holds files already" in capsys.readouterr().err
+    assert "already contains files" in capsys.readouterr().err
 
 
 def test_times():

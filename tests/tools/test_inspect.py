@@ -256,7 +256,7 @@ WRONG = {
     "times in other units": (lambda: within(0.01, ball()), "times: .*run from 0 to 0.01, 1% of"),
     "no times": (
         lambda: within(0, ball(poses=rig())),
-        "one_time: .*train/000.png and train/004.png have one camera",
+        "one_time: .*train/000.png and train/004.png differ, although they have the same camera",
     ),
     "other axes": (turned, "axes: 16 of 16 cameras look away"),
     "world-to-camera poses": (
@@ -538,6 +538,6 @@ def test_a_run_says_what_cameras_and_times_tell(tmp_path, caplog, monkeypatch):
     said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     for words in (
         "no training view shows the times between 0.25 and 0.75",
-        "opaque and end in the background's colour",
+        "opaque, with a background of constant colour",
     ):
         assert sum(words in text for text in said) == 1, words

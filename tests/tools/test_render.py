@@ -108,7 +108,7 @@ def test_a_folder_takes_a_png_per_frame_and_no_others(trained, tmp_path):
     options = VideoOptions(frames=2, size=16, out=f"{tmp_path}/frames/")
     folder = render_video(trained, options)
     assert sorted(p.name for p in folder.iterdir()) == ["frame_0000.png", "frame_0001.png"]
-    with pytest.raises(ConfigError, match="holds files already"):
+    with pytest.raises(ConfigError, match="already contains files"):
         render_video(trained, options)
 
 

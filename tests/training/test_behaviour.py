@@ -263,7 +263,7 @@ def test_a_scene_without_motion_has_no_time_planes(train, overrides, reason):
     assert ("field.time" in checkpoint(folder)["state_dict"]) == (reason is None)
     assert metrics(folder)["skipped"]["static"] == (0.0 if reason is None else 1.0)
     text = (folder / "train.log").read_text()
-    assert ("trains as a static one" in text) == (reason is not None)
+    assert ("static, without time planes" in text) == (reason is not None)
     assert reason is None or reason in text
 
 

@@ -115,8 +115,8 @@ def test_a_dead_field_starts_again_once_and_a_resumed_run_comes_to_the_same_numb
     whole = outcome(train(*QUICK, name="whole"))
     assert len(fields) == whole["restarts"] == 1
     assert fields[0].model.opacity == 1.0
-    words = [r.getMessage() for r in caplog.records if "field shows nothing" in r.getMessage()]
-    assert ["again" in line for line in words] == [True, False]
+    words = [r.getMessage() for r in caplog.records if "field is empty" in r.getMessage()]
+    assert ["re-initialised" in line for line in words] == [True, False]
     assert "at step 5" in words[0]
     assert "data.half_side" in words[1]
 
@@ -153,7 +153,7 @@ def test_the_thing_is_scored_where_most_of_a_pixel_shows_it():
 def test_a_run_that_shows_nothing_says_so(train, capsys):
     """The decoder's density bias leaves the field empty, and there is no step to change it."""
     folder = train("trainer.max_steps=1", "model.decoder.density_bias=-60", "data.seed=0")
-    assert "this run shows nothing yet" in capsys.readouterr().out
+    assert "this run has learnt nothing yet" in capsys.readouterr().out
     content = metrics(folder)
     assert content["test"]["psnr"] == pytest.approx(content["blank_psnr"], abs=0.01)
     assert content["test"]["floaters"] == 0

@@ -78,5 +78,5 @@ def test_a_scene_without_motion_trains_as_a_static_one(train):
     assert not loaded.module.field.moves
     assert loaded.module.renderer.grid.time_bins == 1
     said = (folder / "train.log").read_text()
-    assert "trains as a static one" in said
+    assert "static, without time planes" in said
     assert "frames are equal" in said

@@ -144,7 +144,9 @@ def test_an_unconverged_decomposition_warns_once_and_goes_on_in_its_own_frame_al
     assert f"from     8 triplanes of {tmp_path}/triplanes.pt" in said.out
     assert "time planes rank1" in said.out
     assert not metrics(folder)["decomposition"]["xy"]["converged"]
-    with pytest.raises(ConfigError, match=r"frame is not the checkpoint's \(scale .*0\.5.*0\.6"):
+    with pytest.raises(
+        ConfigError, match=r"frame differs from the checkpoint's \(scale .*0\.5.*0\.6"
+    ):
         trained(0.6, 4)
     assert (folder / "checkpoints" / "last.ckpt").read_bytes() == before
 

@@ -194,9 +194,9 @@ NOT_FINITE += r"finite: correct losses\.mine or omit it{}"
             r"step 0 on.*gradient of field\.space.*check the val.*of XPlanes",
         ),
         ("gradient", False, 99, r"step 0 on.*of XPlanes and losses\.mine"),
-        ("gradient", True, None, r"step 0 on.*initialisation is to blame.*lrm=none"),
-        ("bias", True, None, r"initialisation is to blame.*set lrm=none"),
-        ("bias", False, None, r"No step was done yet: check the values and gradients of XPlanes"),
+        ("gradient", True, None, r"step 0 on.*initialisation is the cause.*lrm=none"),
+        ("bias", True, None, r"initialisation is the cause.*set lrm=none"),
+        ("bias", False, None, r"No step .*completed: check the values and gradients of XPlanes"),
         ("nothing", False, 0, NOT_FINITE.format(0, "$")),
         ("nothing", False, 7, NOT_FINITE.format(7, "; resume=")),
     ],
@@ -275,7 +275,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_best(train, whole, folder, caplog
 def test_a_lost_checkpoint_gives_way_to_the_best_or_is_missed_aloud(folder, caplog):
     last, best = (folder / "checkpoints" / f"{name}.ckpt" for name in ("last", "best"))
     last.unlink()
-    with pytest.raises(ConfigError, match="holds a run already"):
+    with pytest.raises(ConfigError, match="already holds a run"):
         claim(folder, resume=False)
     assert find_resumable(last.parent) == last
     assert last.read_bytes() == best.read_bytes()
@@ -299,7 +299,7 @@ def test_damaged_checkpoints_alone_are_refused_with_a_message(tmp_path):
 def test_a_sound_checkpoint_that_cannot_be_read_is_not_called_damaged(tmp_path):
     path = tmp_path / "last.ckpt"
     torch.save({"place": PurePosixPath("anywhere")}, path)
-    with pytest.raises(ConfigError, match=r"last\.ckpt holds more than data \(pathlib\.PurePos"):
+    with pytest.raises(ConfigError, match=r"last\.ckpt is not plain data \(pathlib\.PurePos"):
         load_checkpoint(path)
     with (
         patch("zipfile.ZipFile", side_effect=PermissionError(13, "Permission denied")),
@@ -325,10 +325,10 @@ def test_a_refused_resume_keeps_the_earlier_settings(tmp_path, refusal):
 
 def test_a_damaged_record_does_not_end_a_run(train, folder, caplog):
     (folder / "run.json").write_text('{"status": "runn')
-    with pytest.raises(ConfigError, match=r"holds a run already \(damaged\)"):
+    with pytest.raises(ConfigError, match=r"already holds a run \(damaged\)"):
         train(*SCORED)
     train(*SCORED, resume=True)
-    assert "record of this run starts again" in caplog.text
+    assert "starting a new record of this run" in caplog.text
     record = status(folder)
     assert (record["status"], record["resumed"]) == ("finished", 1)
     # What was evaluated again stands in the curve once.

@@ -16,7 +16,7 @@ from xplanes.scenes.silhouettes import count_in_squares
 from xplanes.scenes.views import Scene, Views, spread
 
 GAP_SPACINGS, GAP_SPAN = 12.0, 0.05
-"""Shortest gap in time that is reported: in median spacings, and as a share of the span."""
+"""Shortest gap in time that is reported: in median spacings, and as a share of the time span."""
 
 SHORT_SPAN = 0.2
 """Least share of [0, 1] that times should cover; less suggests wrong scaling."""
@@ -28,11 +28,11 @@ SMALL, LARGE = 0.03, 3.0
 """Range of plausible half sides of the cube, in units of the cameras' median distance."""
 
 ASUNDER, TOGETHER = 0.2, 0.1
-"""How far optical axes pass by one another, relative to the cameras' distance: poses that are
-probably wrong, and those that are right."""
+"""Distance of optical axes from their common point, relative to that of the cameras: above the
+first, poses are probably wrong; below the second, they are probably right."""
 
 EVEN = 0.35
-"""Least distance from the point where axes meet of nine in ten cameras, in units of the median."""
+"""Least distance of nine in ten orbiting cameras from the point where axes meet, in medians."""
 
 PALE_STEPS = 16
 """Colour difference, out of 255, below which two pixels count as equal."""
@@ -84,7 +84,7 @@ def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
 
 
 def scene_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
-    """Problems that a run warns of before it trains; arguments as for `camera_findings`."""
+    """Problems that a run warns about before training; arguments as for `camera_findings`."""
     yield from camera_findings(scene, frame)
     yield from opaque_findings(scene)
     views = scene.splits["train"]
@@ -99,8 +99,8 @@ def opaque_findings(scene: Scene) -> Iterator[Finding]:
     if scene.splits["train"].is_opaque and not scene.is_surrounded:
         yield Finding(
             "white",
-            "the images are opaque and end in the background's colour: there an empty field and a "
-            "filled one look the same. Write RGBA images or masks",
+            "the images are opaque, with a background of constant colour: empty space and content "
+            "of that colour look the same. Write RGBA images or masks",
         )
 
 
@@ -146,8 +146,8 @@ def _times(scene: Scene, train: Views) -> Iterator[Finding]:
         yield Finding(
             "one_time",
             f"all training views have the time {float(times[0]):.3g}, but {first} and {second} "
-            "have one camera and differ: the scene moves. Give every image its time, or use only "
-            "images of one timestep",
+            "differ, although they have the same camera: the scene moves. Give every image its "
+            "time, or use only images of one timestep",
         )
 
 
@@ -173,7 +173,7 @@ def shared(scene: Scene) -> Iterator[Finding]:
     for split in [name for name in scene.splits if name != "train"]:
         views, found = scene.splits[split], []
         if views is train:
-            continue  # Too few views to hold some out, as the reader says.
+            continue  # Too few views to hold some out; the reader has warned.
         for index, file in enumerate(views.files):
             pose, time = views.camera_to_world[index], views.times[index]
             near = (poses - pose.double()).abs().flatten(1).amax(dim=1) <= max(room, 1e-9)
@@ -229,12 +229,12 @@ def calibrations(views: Views) -> list[tuple[float, ...]]:
 
 
 def _outward(views: Views) -> Finding | None:
-    """Finds cameras that look away from the point where their axes meet, or at none at all."""
+    """Finds cameras that face away from the point where axes meet, and axes that do not meet."""
     along, missed = _meeting(views)
     inverse = replace(views, camera_to_world=torch.linalg.inv(views.camera_to_world))
     if missed > ASUNDER and axes_meet(inverse):
         ahead, missed = _meeting(inverse)
-        # Cameras that walk straight on seem to orbit a point as well, but at any distance from it.
+        # A camera that moves straight ahead also seems to orbit a point, but at varying distance.
         distance = ahead.abs()
         orbits = distance.quantile(0.1) > EVEN * distance.median()
         if missed < TOGETHER and orbits:
@@ -243,8 +243,8 @@ def _outward(views: Views) -> Finding | None:
                 "axes",
                 "the cameras' axes do not meet, but those of the inverse poses do: the poses seem "
                 "to be world-to-camera. They must be camera-to-world: invert the matrix of every "
-                f"frame{then if (ahead < 0).double().mean() > 0.5 else ''}. A camera that turns on "
-                "the spot gives the same picture, but sees no common volume",
+                f"frame{then if (ahead < 0).double().mean() > 0.5 else ''}. A camera that rotates "
+                "in place gives the same result, but its views have no common volume",
             )
     # Axes that are nearly parallel may meet anywhere.
     away = int((along < 0).sum())
@@ -261,9 +261,9 @@ def _outward(views: Views) -> Finding | None:
 
 
 def _meeting(views: Views) -> tuple[Tensor, float]:
-    """Depth in each camera of the point nearest to all axes, and how far these pass by it.
+    """Depth in each camera of the point nearest to all axes, and the axes' distance from it.
 
-    The latter is relative to the cameras' distance from the point.
+    The distance is the RMS over all axes, relative to that of the cameras from the point.
     """
     offset = optical_centre(views).double() - views.camera_to_world[:, :3, 3].double()
     axis = -backwards(views).double()

@@ -101,8 +101,8 @@ def check_video(path: Path, *, frames: int, folder: bool = False) -> None:
         require("imageio.v2", extra="video")
     elif path.suffix in IMAGES and frames > 1:
         raise ConfigError(
-            f"{path} is one image, not {frames}: to write one PNG per frame, name a folder "
-            f"with / at its end ({path.with_suffix('')}/)"
+            f"{path} is a single image, but there are {frames} frames: to write one PNG per frame, "
+            f"name a folder with / at its end ({path.with_suffix('')}/)"
         )
     elif path.suffix not in (".webp", *IMAGES):
         raise ConfigError(
@@ -168,15 +168,15 @@ SHOWN = 0.5
 """Share of the timesteps that a camera must show for a video to stay with it."""
 
 FEW_CAMERAS = 4
-"""Number of calibrations up to which each is taken for a camera of its own."""
+"""Largest number of calibrations for which each is assumed to be a separate camera."""
 
 
 def training_path(views: Views, count: int) -> tuple[list[int], Tensor]:
-    """Cameras of a video from where training cameras were, and the time of each frame.
+    """Cameras of a video at training views, and the time of each frame.
 
-    A camera of a rig, which shows most timesteps, stays in place while time runs from 0 to 1.
-    Otherwise the video follows one moving camera: from view to view in the order of their times,
-    from each timestep the nearest.
+    If a fixed camera shows most timesteps, the video stays with it while time runs from 0 to 1.
+    Otherwise it follows the views of one moving camera in temporal order, with the nearest view of
+    each timestep.
 
     Args:
         views: Training views.
@@ -252,7 +252,7 @@ class RunVideo:
 
     @classmethod
     def of(cls, scene: Scene, frame: Frame) -> "RunVideo":
-        """The video of a scene: an orbit shows an object, but not surroundings, from everywhere."""
+        """The video of a scene: an orbit of an object; with surroundings, a `training_path`."""
         views = scene.splits["train"]
         size = min(VIDEO_SIZE, 2 * max(views.height, views.width))
         if not scene.is_surrounded:

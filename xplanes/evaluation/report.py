@@ -29,10 +29,10 @@ from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, blank_psnr, mean_colour, mean_scores
 
 LITTLE = 0.5
-"""Gain in dB over images of background alone below which a run has learnt nothing."""
+"""Gain in dB over background-only images below which a run has learnt nothing."""
 
 LONG = 30.0
-"""Seconds of scores and images from which the header may say how to shorten them."""
+"""Seconds of scores and images above which the header may say how to shorten them."""
 
 BUSY = 0.6
 """CPU time per second of training on the CPU below which a run warns."""
@@ -79,7 +79,7 @@ def header(
     moving = ""
     if not module.field.moves:
         reason = scene.static_reason or "one timestep only"
-        moving = f" · trains as a static one, without time planes: {reason}"
+        moving = f" · static, without time planes: {reason}"
     budget = {"step": trainer.get("max_steps", -1), "epoch": trainer.get("max_epochs")}
     budget = {unit: count for unit, count in budget.items() if count is not None and count >= 0}
     limits = [f"{count} {unit}{'s' * (count != 1)}" for unit, count in budget.items()]
@@ -151,8 +151,8 @@ def estimated(
     text = f"{spent + train + images:.0f} s in all: {parts.format(f'{train:.0f} s')}"
     if images > max(train, LONG):
         text += (
-            "\n         scores and images take longer than training: media=false "
-            '"callbacks.evaluation.at=[1]" data.eval_views=4 shorten them'
+            "\n         scores and images take longer than training; to shorten them: media=false "
+            '"callbacks.evaluation.at=[1]" data.eval_views=4'
         )
     return text
 
@@ -260,8 +260,8 @@ def log_hparams(trainer: Trainer, experiment: Experiment, metrics: dict[str, Any
         if isinstance(logger, TensorBoardLogger):
             with SummaryWriter(logger.log_dir) as writer:
                 assert writer.file_writer is not None
-                for summary in hparams(parameters, scores):
-                    writer.file_writer.add_summary(summary)
+                for entry in hparams(parameters, scores):
+                    writer.file_writer.add_summary(entry)
                 for name in scores.keys() - trainer.logged_metrics.keys():  # Others are logged.
                     writer.add_scalar(name, scores[name], metrics["step"])
         else:
@@ -270,7 +270,7 @@ def log_hparams(trainer: Trainer, experiment: Experiment, metrics: dict[str, Any
 
 
 def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
-    """The lines printed at the end: scores, time, paths, and what to do next."""
+    """The lines printed at the end: scores, time, paths, and suggested next commands."""
     seconds, skipped = metrics["seconds"], metrics["skipped"]
     limits, more = experiment.trainer, ""
     if 0 <= limits.get("max_steps", -1) <= 2 * metrics["step"]:
@@ -289,8 +289,8 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
     ]
     if test["psnr"] < blank + LITTLE:
         lines.append(
-            f"warning  hardly better than images of background alone ({blank:.2f} dB): this run "
-            "shows nothing yet"
+            f"warning  hardly better than background-only images ({blank:.2f} dB): this run has "
+            "learnt nothing yet"
         )
     if (share := test.get("floaters", 0)) > CLUTTERED:
         lines.append(
@@ -300,7 +300,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
         )
     if experiment.device.type == "cpu" and (share := metrics["cpu_share"]) < BUSY:
         lines.append(
-            f"warning  training got {share:.1f} s of CPU time a second: other programs use this "
+            f"warning  training got {share:.1f} s of CPU time per second: other programs use this "
             "machine, or a disk\n         is slow; an idle machine trains further in the same time"
         )
     if (cameras := metrics.get("cameras")) is not None:
@@ -325,7 +325,7 @@ def closing(run: Path, experiment: Experiment, metrics: dict[str, Any]) -> str:
             f"skipped  {100 * skipped['empty']:.0f}% of samples in empty space, "
             f"{100 * skipped['occluded']:.0f}% behind surfaces, "
             f"{100 * skipped['background']:.0f}% of pixels as background; "
-            f"{metrics['samples_per_ray']:.1f} samples a ray remained"
+            f"{metrics['samples_per_ray']:.1f} samples per ray remained"
         )
     place = shlex.quote(str(run))
     steps = [f"tensorboard --logdir {place}"] * any(run.rglob("events.out.tfevents.*"))

@@ -180,7 +180,7 @@ class ModelSettings(Settings, ABC):
 
         Args:
             views: Training views.
-            hints: What is known of the scene's cube.
+            hints: Information about the scene's cube.
 
         Raises:
             SceneError: If the cameras see no common volume.
@@ -188,9 +188,9 @@ class ModelSettings(Settings, ABC):
         return scene_frame(views, hints)
 
     def for_scene(self, views: Views, hints: CubeHints = NO_HINTS) -> "ModelSettings":
-        """The settings with cube, near and far from the scene, where published ones do not fit it.
+        """The settings with the scene's cube, near and far, where published ones do not fit it.
 
-        Unchanged by default: the field and the sampler of most models take them from the scene.
+        Unchanged by default: most models take these from the scene anyway.
 
         Args:
             views: Training views.

@@ -22,7 +22,7 @@ NO_TIME: dict[str, float] = dict.fromkeys(STAGES, 0.0)
 """Seconds of each stage, all 0."""
 
 NOTHING_SKIPPED = {"frames": 0.0, "directions": 0.0}
-"""Shares of the work that was left out, all 0."""
+"""Shares of work that was skipped, all 0."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Place:
         device: Device of the computation.
         devices: Number of processes that share the run.
         say: Prints a line before a slow stage.
-        hints: What is known of the scene's cube.
+        hints: Information about the scene's cube.
     """
 
     scene: Scene

@@ -42,10 +42,10 @@ from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
 from xplanes.streams import Stream, TrainingState, initial_values, step_generator
 
 RIG_VIEWS = 2
-"""Views that show each timestep of a rig, on average."""
+"""Minimum mean number of views per timestep for which cameras count as a rig."""
 
 MOST_SMOOTH = 10.0
-"""Largest factor on total variation where few cameras look."""
+"""Largest factor on total variation for few camera positions."""
 
 FINE_WARMUP = 100
 """Warm-up steps of the fine planes' learning rate."""
@@ -54,8 +54,8 @@ TEXELS_PER_PIXEL, TEXEL_STEP, MOST_TEXELS = 0.66, 32, 256
 """Fine planes with texels=auto: texels per image pixel, rounding step, and maximum of texels."""
 
 USUAL_TEXELS, MORE_TEXELS, LEAST_PIXELS = 64, 96, 480
-"""Space planes with resolution=auto: texels, and more texels where as many pixels cover the cube
-and as many camera positions show a moving scene with surroundings."""
+"""Space planes with resolution=auto: texels by default; texels for moving scenes with surroundings
+and many camera positions; and image pixels across the cube that the latter require."""
 
 FINER = 2.0
 """With texels=auto, fine planes need at least this many times the texels of space planes."""
@@ -106,9 +106,9 @@ class XPlanesLoss(Settings):
     total_variation: Weight  # Weight of the space planes' total variation.
     # Replaces `model.loss.total_variation` in moving scenes if a background is learnt.
     total_variation_with_background: Weight
-    # Number of camera positions for which the weights of the coarse space planes are meant. With
-    # fewer they are larger in inverse proportion, up to tenfold, and that of the background by the
-    # square root of this, unless an LRM initialises the field; null: never.
+    # With fewer camera positions than this, the total variation of coarse space planes is weighted
+    # more, in inverse proportion and up to tenfold, and the background's by the square root of that
+    # factor. Not for fields initialised from an LRM. null: never.
     variation_views: Count | None
     # Factor on the three weights of time planes below if a background is learnt.
     time_factor_with_background: Share
@@ -122,8 +122,8 @@ class XPlanesLoss(Settings):
     # persists.
     passing: Weight
     passing_steps: Steps  # Steps over which `model.loss.passing` falls to 0.
-    # The same for rigs, where at least two views show each timestep on average. There, light that
-    # is stopped near a face of the cube counts as passing, as in `model.sampler.border`.
+    # The same for rigs, where at least two views show each timestep on average. For rigs, light
+    # absorbed near a face of the cube counts as passing, as in `model.sampler.border`.
     rig_passing_steps: Steps
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
     sparse_weight: Weight  # Weight of L_r (X-Planes, Eq. 17).
@@ -263,7 +263,7 @@ class XPlanesSettings(ModelSettings):
         else:
             with torch.no_grad():
                 decoder.layers[-1].bias[0] += options.density_bias  # type: ignore[index]
-                if background is None:  # White fog in front of a learnt background would fade away.
+                if background is None:  # A learnt background would replace white fog.
                     decoder.layers[-1].bias[1:] += options.colour_bias  # type: ignore[index]
         decoder.requires_grad_(not options.freeze)
         return self.field_class(
@@ -346,7 +346,7 @@ class XPlanesModel(Model):
         return None if self.product is None else self.product.sparse
 
     def _few_views(self, site: Site) -> float:
-        """Factor on total variation: the fewer the images, the more a prior must tell."""
+        """Factor on total variation: the fewer the camera positions, the larger."""
         wanted = self.weights.variation_views
         if wanted is None or site.positions is None or site.initialised:
             return 1.0

@@ -62,7 +62,7 @@ class Batches(ABC):
     Attributes:
         views: Training views.
         rays: Number of rays per batch.
-        skipped: Share of the rays that go to other pixels than with uniform sampling.
+        skipped: Share of the rays that would go to other pixels with uniform sampling.
     """
 
     views: Views
@@ -145,8 +145,8 @@ class RaySettings(BatchSettings):
     skip_background: bool  # Sample more rays near silhouettes, on texture and where images change.
     background_share: Share  # Share of rays far from silhouettes.
     background_jitter: Share  # Maximum random time offset of these rays.
-    # Share of rays that are drawn in proportion to the error of the field where their pixels lie.
-    # Weights in the losses of colour and opacity make up for it. For images in memory; 0: none.
+    # Share of rays that are drawn in proportion to the field's error in their image tile. Weights
+    # in the losses of colour and opacity correct for this. For images in memory; 0: none.
     error_share: Share
     # Learn a gain per colour channel of each training camera, if the images show surroundings.
     match_exposure: bool
@@ -238,7 +238,7 @@ class RayBatches(Batches):
 
     With ``skip_background``, at most ``background_share`` of the rays go to pixels far from the
     silhouettes. These show only background, and a few rays suffice to prevent floaters. Far rays
-    with alpha 0 get slightly earlier or later times, at which their space is also taken for empty.
+    with alpha 0 get slightly earlier or later times: their space is assumed to be empty then, too.
     At most `TEXTURELESS_SHARE` go to opaque pixels without texture, such as those of a white floor.
     In opaque images of fixed cameras, changing pixels take the role of silhouettes: at most
     `STATIC_SHARE` of the rays go to static pixels, without changed times.

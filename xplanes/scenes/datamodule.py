@@ -217,7 +217,7 @@ class SceneDataModule(LightningDataModule):
         chosen[order[held_out_places(times.tolist(), HELD_OUT)]] = True
         train, val = (train.subset(part.nonzero()[:, 0]) for part in (~chosen, chosen))
         shared, self.held_out = {*val.files}, len(val)
-        # How many are scored must not change what is trained on.
+        # The number of scored views must not change the training views.
         if (most := self.settings.eval_views) is not None:
             val = val.subset(spread(most, len(val)))
         self._scene = replace(

@@ -18,7 +18,7 @@ from xplanes.settings import Count, Location, Positive, Settings
 
 
 class Timed(Protocol):
-    """What a split is before or after its images are read: images with times."""
+    """A split, before or after its images are read: a sequence with times."""
 
     @property
     def times(self) -> Tensor: ...
@@ -70,7 +70,7 @@ def frames_are_equal(video: Views) -> bool:
 
 
 def as_static(scene: Scene, reason: str) -> Scene:
-    """The scene, made static: all views at time 0, and one frame of its video.
+    """The scene as a static one: all views at time 0, and one frame of its video.
 
     Args:
         scene: The scene.
@@ -96,7 +96,7 @@ class SceneSettings(Settings, ABC):
     name: str  # Name of the format in run directories and tables.
     root: Location  # Folder that holds the scenes.
     scene: Location  # Folder of the scene, or name of the demo scene.
-    # Width of the images in pixels, or theirs if that is less; null keeps the native size.
+    # Maximum width of the images in pixels; null keeps the native size.
     resolution: Count | None
     views: Count | None  # Training views, spread over time; null for all.
     train_on_video: bool  # Also train on the frames of the fixed camera.
@@ -104,7 +104,7 @@ class SceneSettings(Settings, ABC):
     eval_split: Literal["test", "val"] | None  # Split to score; null: val, then test at the end.
     eval_views: Count | None  # Maximum views per scored split, spread over time; null for all.
     half_side: Positive | None  # Half the side of the scene's bounding cube; null estimates it.
-    # Its centre: three coordinates in the world after turning (data.orient), as in the line cube of
+    # Centre of the bounding cube in world coordinates, after data.orient, as in the line cube of
     # xplanes inspect; null estimates it.
     centre: Sequence[float] | None
     refine_cameras: bool  # Correct the poses of the training cameras while the field is trained.
@@ -117,14 +117,14 @@ class SceneSettings(Settings, ABC):
     """Further advice if there is no such scene."""
 
     numbers_are_times: ClassVar[bool] = False
-    """Whether ``static=false`` takes numbers in the images' names for times that are missing."""
+    """Whether ``static=false`` reads missing times from numbers in the images' names."""
 
     def check(self) -> None:
         if self.centre is not None and len(self.centre) != 3:
             raise ConfigError(f"centre={self.centre}: must be three world coordinates, [x,y,z]")
 
     def hints(self, scene: Scene) -> CubeHints:
-        """What is known of a scene's cube."""
+        """Information about a scene's cube other than its views."""
         return CubeHints(self.half_side, self.centre, scene.points)
 
     @property

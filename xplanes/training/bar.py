@@ -82,7 +82,7 @@ class StepBar(ProgressBar):
             self.stream.write("\n")
 
     def _is_due(self, trainer: Trainer) -> bool:
-        """Whether to show a line now; the next one is due later."""
+        """Whether to show a line now; if so, schedules the next one."""
         now = time.monotonic()
         due = self._shown and trainer.is_global_zero and now >= self._due
         self._due = now + self._every if due else self._due

@@ -1,4 +1,4 @@
-"""Builds a field with its model and sampler, from a scene or a checkpoint; sums their losses."""
+"""Builds field, model and sampler from a scene or a checkpoint, and sums their losses."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -41,7 +41,7 @@ class Parts:
     """A field with its model and sampler.
 
     Attributes:
-        settings: The model's settings, with those that the initialisation determines.
+        settings: The model's settings, including those set by the initialisation.
         site: Context for which the field was built.
         model: The model, which has the field.
         sampler: The sampler, which renders the field.
@@ -115,7 +115,7 @@ def build_parts(
     Args:
         method: All settings except those of the data and the Trainer.
         scene: The scene, with a ``train`` split.
-        hints: What is known of the scene's cube; the scene's points when None.
+        hints: Information about the scene's cube; the scene's points when None.
         device: Device on which the field will be trained; the CPU when None.
         devices: Number of processes that share the run.
         initialisation: The field's initialisation; computed from ``lrm`` when None.
@@ -277,10 +277,10 @@ def require_frame(parts: Parts, content: Mapping[str, Any]) -> None:
         before = torch.as_tensor(getattr(trained, name))
         if not torch.allclose(before, torch.as_tensor(now), rtol=1e-4, atol=1e-5):
             raise ConfigError(
-                f"the initialisation was computed again, and its frame is not the checkpoint's "
-                f"({name} {before.tolist()}, now {torch.as_tensor(now).tolist()}): its entry in "
-                "preparation.cache is gone. Restore it, or start a new run in another "
-                "folder"
+                "the initialisation was recomputed, because its entry in preparation.cache is "
+                f"gone, and its frame differs from the checkpoint's ({name} {before.tolist()}, now "
+                f"{torch.as_tensor(now).tolist()}): restore the entry, or start a new run in "
+                "another folder"
             )
 
 
@@ -307,12 +307,12 @@ def require_version(path: Any) -> None:
         return
     if made.split(".")[:2] != __version__.split(".")[:2]:
         raise ConfigError(
-            f"{path} was made by xplanes {made}, whose settings are not those of {__version__}: "
+            f"{path} was made by xplanes {made}, whose settings differ from {__version__}: "
             "load it with that version, or start a new run"
         )
 
 
-def require_whole_floats(precision: str) -> None:
+def require_float32(precision: str) -> None:
     """Refuse a Trainer that changes the precision: the model sets its own.
 
     Raises:
@@ -320,8 +320,8 @@ def require_whole_floats(precision: str) -> None:
     """
     if precision not in ("32", "32-true"):
         raise ConfigError(
-            f"precision={precision}: the precision of products is model.precision (auto, 32 or "
-            "bf16), and planes are float32; leave it out"
+            f"precision={precision}: planes are float32, and model.precision (auto, 32 or bf16) "
+            "sets the precision of matrix products; leave it out"
         )
 
 
@@ -339,7 +339,7 @@ def require_new_rays(overfit_batches: float) -> None:
 
 
 def require_groups(model: Model, sampler: Sampler) -> None:
-    """Refuse parameter groups that training cannot work with.
+    """Refuse parameter groups that training cannot use.
 
     Raises:
         ConfigError: With an example of a complete group.
@@ -360,8 +360,8 @@ def require_groups(model: Model, sampler: Sampler) -> None:
     for name, key in keys:
         if key not in optimizer.defaults:
             raise ConfigError(
-                f"{place}: {type(optimizer).__name__} takes no {key!r}, which the group {name} "
-                f"has; it takes {', '.join(optimizer.defaults)}"
+                f"{place}: the group {name} has {key!r}, which {type(optimizer).__name__} does not "
+                f"accept; it accepts {', '.join(optimizer.defaults)}"
             )
     trained = {id(parameter) for group in groups for parameter in group["params"]}
     for part in (model.field, *sampler.modules.values()):

@@ -44,7 +44,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 def _require_data(checkpoint: Mapping[str, Any]) -> None:
-    """Refuse a state that could be written but not read, such as numpy numbers in a callback.
+    """Refuse a state that could be saved but not loaded, such as numpy numbers in a callback.
 
     Raises:
         ConfigError: With the name of the part that contains it.
@@ -59,9 +59,9 @@ def _require_data(checkpoint: Mapping[str, Any]) -> None:
                 torch.load(file, weights_only=True)
             except pickle.UnpicklingError as error:
                 raise ConfigError(
-                    f"{name}: its state holds more than data{_kind_in(error)}, so that a "
-                    "checkpoint could not be read again; let state_dict return tensors, numbers, "
-                    "text, lists and dictionaries"
+                    f"{name}: its state is not plain data{_kind_in(error)}, so the checkpoint "
+                    "could not be loaded; return only tensors, numbers, strings, lists and "
+                    "dictionaries from state_dict"
                 ) from error
 
 
@@ -72,7 +72,7 @@ def _kind_in(error: pickle.UnpicklingError) -> str:
 
 
 class Checkpoints(ModelCheckpoint):
-    """Writes ``last.ckpt`` at fixed intervals and at the end, ``best.ckpt`` at a new best score.
+    """Writes ``last.ckpt`` at intervals and at the end, and ``best.ckpt`` at each new best score.
 
     They are in ``checkpoints`` in the trainer's ``default_root_dir``; the training clock does not
     count the time to write them. The best one has the highest ``val/psnr``.
@@ -130,7 +130,7 @@ class Checkpoints(ModelCheckpoint):
         self._save_checkpoint(trainer, f"{self.dirpath}/{LAST}")
 
     def _should_skip_saving_checkpoint(self, trainer: Trainer) -> bool:
-        # Allowed after training, too: the last scores may come then, see `Trainer.train`.
+        # Saving is allowed after training: the final scores may come then, see `Trainer.train`.
         return trainer.sanity_checking or not trainer.global_step
 
     def _save_checkpoint(self, trainer: Trainer, filepath: str) -> None:
@@ -189,13 +189,13 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint to the CPU, tensors and builtins only.
 
     Raises:
-        ConfigError: If the file is missing, cannot be read, is damaged, or holds more than data.
+        ConfigError: If the file is missing, cannot be read, is damaged, or is not plain data.
     """
     beside = path.with_name(BEST if path.name == LAST else LAST)
     if not path.is_file():
         if path.name == BEST and beside.is_file():
             raise ConfigError(
-                f"{path} does not exist: no validation scores have chosen a best step; take {LAST} "
+                f"{path} does not exist: there were no validation scores to choose it; use {LAST} "
                 "(--checkpoint last)"
             )
         if path.name == LAST and beside.is_file():
@@ -218,8 +218,8 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path} cannot be read: {error.strerror or error}") from error
     except pickle.UnpicklingError as error:
         raise ConfigError(
-            f"{path} holds more than data{_kind_in(error)}, which is not read from a file; save "
-            "tensors, numbers, text, lists and dictionaries"
+            f"{path} is not plain data{_kind_in(error)}, and is not loaded, because it could run "
+            "code; save only tensors, numbers, strings, lists and dictionaries"
         ) from error
     except Exception as error:
         raise ConfigError(
@@ -230,6 +230,8 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 def training_so_far(path: Path) -> tuple[int, float]:
     """Steps and seconds of the training clock in a checkpoint that `find_resumable` has checked."""
-    content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)  # Without tensors.
+    content = torch.load(
+        path, map_location="cpu", weights_only=True, mmap=True
+    )  # Reads no tensors.
     clock = content.get("callbacks", {}).get(TrainingClock.__qualname__, {})
     return content["global_step"], clock.get("seconds", 0.0)

@@ -1,4 +1,4 @@
-"""What ends training: the training clock, after a time limit, and Ctrl-C, between two steps."""
+"""Ends training between two steps: the training clock at its time limit, Ctrl-C on request."""
 
 import signal
 import threading
@@ -19,7 +19,7 @@ C = TypeVar("C", bound=Callback)
 
 
 SHARED = 8
-"""Batches after which the processes of a distributed run synchronise clocks and stop requests."""
+"""Batches between synchronisations of clocks and stop requests in a distributed run."""
 
 
 def agreeing(trainer: Trainer) -> bool:
@@ -148,7 +148,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class Interrupt(Callback):
-    """The first SIGINT or SIGTERM stops training after the current step, the second at once."""
+    """The first SIGINT or SIGTERM stops training after the current step, the second immediately."""
 
     def __init__(self) -> None:
         self.asked = False

@@ -64,8 +64,8 @@ class CollapseWatch(Callback):
         alone = trainer.world_size == 1
         if pl_module.restarts < self.restarts and alone and pl_module.can_restart:
             logger.warning(
-                "%s at step %d: it is initialised again, with another seed and stronger "
-                "supervision of opacity",
+                "%s at step %d: re-initialised with another seed and stronger supervision of "
+                "opacity",
                 found,
                 trainer.global_step,
             )
@@ -74,8 +74,8 @@ class CollapseWatch(Callback):
         elif not self.collapsed:
             self.collapsed = found
             logger.warning(
-                "%s at step %d. Check the poses, the times and data.half_side with a few images of "
-                "media/, then try another seed or smaller learning rates",
+                "%s at step %d. Check the poses, the times and data.half_side against a few images "
+                "in media/, then try another seed or smaller learning rates",
                 found,
                 trainer.global_step,
             )
@@ -89,17 +89,18 @@ class CollapseWatch(Callback):
 
 
 def verdict(seen: list[tuple[float, float]], *, fog: bool) -> str:
-    """Diagnose a collapse by mean opacities of foreground and background rays; empty if none.
+    """Description of a collapse, from mean opacities of rays; empty if there is none.
 
     Args:
-        seen: One pair per batch, from 0 to 1; NaN if a batch had no such rays.
+        seen: For each batch, mean opacity of foreground and of background rays, from 0 to 1; NaN
+            without such rays.
         fog: Whether to check for fog.
     """
     foreground, background = (
         [value for value in values if not math.isnan(value)] for values in zip(*seen, strict=True)
     )
     if foreground and math.fsum(foreground) < NOTHING * len(foreground):
-        return "the field shows nothing where the images show something"
+        return "the field is empty where the images show an object"
     if fog and background and math.fsum(background) > FOG * len(background):
         return "the field is fog where the images show background"
     return ""

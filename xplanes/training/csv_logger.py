@@ -29,7 +29,7 @@ class CSVLogger(loggers.CSVLogger):
 class _Writer(ExperimentWriter):
     def _check_log_dir_exists(self) -> None:
         """Read an earlier file, where Lightning's class would delete it."""
-        rows = read_rows(Path(self.metrics_file_path))  # The last is cut off if the run was killed.
+        rows = read_rows(Path(self.metrics_file_path))  # The last may be cut off.
         self._earlier: list[Any] = [
             row for row in rows if None not in (*row, *row.values()) and row["step"].isdigit()
         ]

@@ -122,7 +122,7 @@ def require_finite(module: "RadianceModule") -> None:
 def _way_out(
     module: "RadianceModule", broken: Sequence[str] = (), *, rendered: bool = False
 ) -> str:
-    """Advice for ``broken`` loss terms; ``rendered``: parameters and rendering are finite."""
+    """Advice, given ``broken`` loss terms; ``rendered``: parameters and rendering are finite."""
     added = [f"losses.{name}" for name in module.method.losses] if rendered else []
     begun = module.tally.done > 0
     resume = "; resume= continues from the last checkpoint" if begun else ""
@@ -137,8 +137,8 @@ def _way_out(
     if module.site.initialised and not added and not (rendered and broken):
         largest = max(float(p.detach().abs().max()) for p in module.field.parameters())
         return (
-            "No step was done yet, so the initialisation is to blame (largest value "
+            "No step has been completed, so the initialisation is the cause (largest value "
             f"{largest:.3g}): set lrm=none, or use another one"
         )
     checked = " and ".join([type(module.field).__name__, *added])
-    return f"No step was done yet: check the values and gradients of {checked}{precision}"
+    return f"No step has been completed: check the values and gradients of {checked}{precision}"

@@ -25,14 +25,14 @@ SHOWN = 4
 """Number of views whose images are logged at each evaluation."""
 
 ROW, LEAST_VIEWS = 200_000, 2
-"""Pixels that a row of the curve scores by default, in at least so many views."""
+"""Default number of pixels scored for a row of the curve, and minimum number of views."""
 
 CURVE = ("seconds", "step", "split", "psnr", "ssim")
 """Columns of curve.csv."""
 
 
 def affordable(limit: float, views: Views) -> int | float:
-    """Limit on the number of views in a row of the curve: by default few if they are large.
+    """Number or share of views scored for a row of the curve; by default fewer if they are large.
 
     Args:
         limit: ``trainer.limit_val_batches``; 1.0 for the default.
@@ -57,8 +57,8 @@ class Evaluation(Callback):
     views; checkpoints contain the rows so far.
 
     Args:
-        at: Shares of the budget, from 0 to 1. 1 is always scored. Before the first step, random
-            values are not scored in scenes with surroundings, where their images take longest.
+        at: Shares of the budget, from 0 to 1. 1 is always included. Randomly initialised fields of
+            scenes with surroundings are not scored at 0, when they are slowest to render.
 
     Attributes:
         step: Step of the last evaluation; -1 before the first.
@@ -67,7 +67,7 @@ class Evaluation(Callback):
 
     def __init__(self, at: Sequence[float] = (0.0, 1.0)) -> None:
         if any(not 0 <= share <= 1 for share in at):
-            raise ConfigError(f"at={list(at)}: shares of the budget, from 0 to 1")
+            raise ConfigError(f"at={list(at)}: must be shares of the budget, from 0 to 1")
         self.at = sorted(share for share in at if share < 1)
         self.step = -1
         self.seconds = 0.0
@@ -109,7 +109,7 @@ class Evaluation(Callback):
         ends |= pl_module.global_step >= pl_module._steps
         ends &= pl_module.progress >= 1
         if (due or ends) and pl_module.between_updates:
-            # Lightning validates after multiples of this number of batches, so it does so now.
+            # Lightning validates after multiples of this number of batches, hence now.
             trainer.val_check_batch = trainer.fit_loop.epoch_loop.total_batch_idx + 1
         else:
             trainer.val_check_batch = sys.maxsize

@@ -24,7 +24,7 @@ from xplanes.scenes.batches import Batch
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Scene
 from xplanes.settings import Count, Positive, Steps
-from xplanes.training.building import loss_terms, require_new_rays, require_whole_floats
+from xplanes.training.building import loss_terms, require_float32, require_new_rays
 from xplanes.training.checkpoints import AtomicCheckpointIO, Checkpoints, find_resumable
 from xplanes.training.clock import Interrupt, TrainingClock, find_callback
 from xplanes.training.collapse import CollapseWatch
@@ -74,7 +74,7 @@ class Trainer(lightning.Trainer):
         if max_seconds is not None and not max_seconds > 0:
             raise ConfigError(f"max_seconds={max_seconds}: must be above 0, or null for no limit")
         require_new_rays(others.get("overfit_batches", 0))
-        require_whole_floats(str(others.get("precision") or "32-true"))
+        require_float32(str(others.get("precision") or "32-true"))
         for callback in callbacks:
             if isinstance(callback, StochasticWeightAveraging):
                 raise ConfigError(
@@ -143,7 +143,7 @@ class Trainer(lightning.Trainer):
                 raise ConfigError(f"callbacks: EarlyStopping: {error}") from error
             evaluation = find_callback(self, Evaluation)
             if evaluation is not None and evaluation.step != self.global_step:
-                # Lightning skips validation if no steps are left, even if the end is not scored.
+                # Lightning skips validation if no steps are left, even if the last is unscored.
                 self.validate(module, data, verbose=False)
         module.to(device)  # Lightning moves it back to the CPU after training.
 
@@ -227,7 +227,7 @@ def warm_up_loops(module: RadianceModule, data: SceneDataModule, device: torch.d
 def rehearse(module: RadianceModule, rays: Batch) -> None:
     """Run a complete step on a copy of the field, so that its kernels are compiled."""
     site, state = module.site, module.state
-    copied = copy.deepcopy(module.parts, {id(site): site})  # It holds the images.
+    copied = copy.deepcopy(module.parts, {id(site): site})  # The site holds all images.
     model, sampler = copied.model, copied.sampler
     optimizer = model.optimizer([*model.groups(), *sampler.groups()])
     rendering = sampler.render(model.field, rays, state)
@@ -280,13 +280,13 @@ Measured on a capture with surroundings, in which no cell is pruned in the first
 PASSING = 0.25
 """Assumed share of rays that meet no surface, and have samples until empty space is pruned.
 
-It was 0.47 on a capture before a black backdrop and 0 on one inside a room.
+Measured: 0.47 on a capture in front of a black backdrop, 0 on one inside a room.
 """
 
 PASSING_PRUNED = 0.15
 """The same in scenes with surroundings once empty space is pruned.
 
-It was 0.41 before the backdrop, 0.13 on a table and 0 inside the room.
+Measured: 0.41 in front of the backdrop, 0.13 for a scene on a table, 0 inside the room.
 """
 
 OPAQUE = 1000.0
@@ -297,7 +297,7 @@ BEHIND = 0.5
 
 
 def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
-    """Time a step, and some rays of a validation view.
+    """Time a step, and some rays of a test view.
 
     In a trained field surfaces are opaque, so rays end after a few samples. A copy of the field
     with a much higher density approximates it.

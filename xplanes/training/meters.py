@@ -154,7 +154,7 @@ def batch_values(rendering: Rendering, rays: Batch, loss: Tensor) -> dict[str, T
     values["rays"] = count if shown is None else shown.sum()
     error = (rendering.colour - rays["target"]).square().mean(dim=1)
     error = error * rays.get("weight", 1)
-    values["error"] = error.mean() if shown is None else masked_mean(error, shown)
+    values["error"] = masked_mean(error, shown)
     return values
 
 

@@ -35,10 +35,10 @@ from xplanes.training.building import (
     build_parts,
     loss_terms,
     parts_from,
+    require_float32,
     require_frame,
     require_new_rays,
     require_version,
-    require_whole_floats,
     site_content,
 )
 from xplanes.training.clock import training_seconds
@@ -63,7 +63,7 @@ class RadianceModule(LightningModule):
     """Trains a field on rays, supervised by the images' colours.
 
     The field is built in `configure_model`, when the scene is known; a configured LRM runs there,
-    too. Checkpoints include all that the field takes from the data and the LRM, so that
+    too. Checkpoints include everything the field takes from the data and the LRM, so
     ``RadianceModule.load_from_checkpoint(path)`` needs only the file (and ``plugins``, if used).
 
     A step is `training_step` (render the rays, sum the loss terms), `on_before_optimizer_step`
@@ -74,7 +74,7 @@ class RadianceModule(LightningModule):
     Args:
         config: The keys ``seed``, ``model``, ``lrm``, ``preparation``, ``decomposition`` and
             ``losses`` (optional) of a configuration, as dicts, lists, numbers and strings; others
-            are ignored. Or a `Method`, with settings that are already parsed.
+            are ignored. Or an already parsed `Method`.
         plugins: Names of the user's modules whose classes the configuration may name.
 
     Raises:
@@ -86,7 +86,7 @@ class RadianceModule(LightningModule):
         parsed = isinstance(config, Method)
         self.method = config if parsed else _read(config, plugins)
         plain = config.plain() if parsed else config
-        # Without plug-ins: a file from somebody else must not choose what is imported.
+        # Without plug-ins: a checkpoint must not decide which modules are imported.
         kept = {name: plain[name] for name in Method.GROUPS if name in plain}
         self.save_hyperparameters({"config": kept})
         self._plugins = tuple(plugins)
@@ -97,7 +97,7 @@ class RadianceModule(LightningModule):
         self.rays = 0
         """Number of rays in the next batch; 0 for whole views."""
         self.restarts = 0
-        """How often the field was re-initialised, see `restart`."""
+        """Number of times the field was re-initialised, see `restart`."""
         self.advice: str | None = None
         """Advice if the loss is not finite; the model's own when None."""
         self.between_updates = True
@@ -158,7 +158,7 @@ class RadianceModule(LightningModule):
     # Building
 
     def setup(self, stage: str) -> None:
-        require_whole_floats(str(self.trainer.precision))
+        require_float32(str(self.trainer.precision))
         require_new_rays(self.trainer.overfit_batches)  # type: ignore[attr-defined]
 
     def configure_model(self) -> None:
@@ -247,12 +247,12 @@ class RadianceModule(LightningModule):
         return self.parts.sampler.renderer
 
     def corrected(self, poses: Tensor) -> Tensor:
-        """Poses in the world as training has corrected them. [V, 4, 4]"""
+        """World poses with the corrections that training has learnt. [V, 4, 4]"""
         frame = self.frame
         return poses if frame is None else self.sampler.corrected(poses, frame)
 
     def corrected_scene(self, scene: Scene) -> Scene:
-        """A scene with the poses that training has corrected."""
+        """A scene with corrected poses."""
         splits = {
             name: replace(views, camera_to_world=self.corrected(views.camera_to_world))
             for name, views in scene.splits.items()
@@ -263,7 +263,7 @@ class RadianceModule(LightningModule):
     def _ddp_params_and_buffers_to_ignore(self) -> list[str]:
         """Buffers that DDP does not broadcast from the first process before each step.
 
-        The occupancy grid has 20 MB; the processes synchronise it at intervals.
+        The occupancy grid takes 20 MB; the processes synchronise it at intervals.
         """
         modules = self.sampler.modules.items()
         return [f"{name}.{key}" for name, part in modules for key, _ in part.named_buffers()]
@@ -299,13 +299,13 @@ class RadianceModule(LightningModule):
             if isinstance(callback, WeightAveraging):
                 raise ConfigError(
                     f"callbacks: {type(callback).__name__}: {type(self.model).__name__} changes "
-                    "its parameters' shapes in training, so that they have no mean; leave it out"
+                    "its parameters' shapes in training, so weights have no mean; leave it out"
                 )
         # An earlier fit may have been interrupted within a step.
         self.between_updates, self._losses, self._seen = True, [], None
 
     def on_train_start(self) -> None:
-        if self.global_rank:  # What a checkpoint holds counts once, in the first process.
+        if self.global_rank:  # Sums from a checkpoint must count only once, in the first process.
             for part in self.sampler.modules.values():
                 for name in getattr(part, "own", ()):
                     getattr(part, name).zero_()
@@ -397,8 +397,8 @@ class RadianceModule(LightningModule):
         """Whether the last batch is to be logged: it ends a step that Lightning logs."""
         trainer: Any = self.trainer
         every, loop = trainer.log_every_n_steps, trainer.fit_loop.epoch_loop
-        # Lightning's own count: it begins at 0 even if the module was loaded, and the last batches
-        # of an epoch may make a step of fewer batches.
+        # Lightning's own count: it begins at 0 even if the module was loaded, and the last step of
+        # an epoch may have fewer batches.
         step = loop._batches_that_stepped + 1
         ends = not loop._should_accumulate()
         return bool(every and not step % every and ends and trainer.loggers)
@@ -483,7 +483,7 @@ class RadianceModule(LightningModule):
         means = {f"{tag}/{name}": value for name, value in mean_scores(self.scores).items()}
         self.tally.last |= means
         if self.trainer.state.fn == TrainerFn.FITTING:
-            # Lightning's own count is one less, and does not continue in a resumed run.
+            # Lightning's own count is one less, and restarts in a resumed run.
             means["step"] = float(self.trainer.global_step)
         # All processes already have the means of all views; sync_dist avoids Lightning's warning.
         self.log_dict(means, batch_size=1, sync_dist=self.trainer.world_size > 1)
@@ -493,7 +493,7 @@ class RadianceModule(LightningModule):
     def agree(self) -> None:
         """Copy the sampler's buffers from the first process to all others.
 
-        Each has observed only its own rays; afterwards all score and save the same field.
+        Each has observed only its own rays; with equal buffers all score and save the same field.
         """
         if self._trainer is None or self._trainer.world_size == 1:
             return

@@ -1,4 +1,4 @@
-"""The run directory: which process may write it, run.json, config.yaml and train.log."""
+"""The run directory: run.json, config.yaml, train.log, and checks before a run uses it."""
 
 import logging
 import os
@@ -34,7 +34,7 @@ KEPT = """model.name lrm.name model.sampler.name data.name data.scene data.seed 
 data.views data.train_views data.train_on_video data.static data.half_side data.centre
 data.refine_cameras data.eval_split data.eval_every data.test_cameras data.frames data.protocol
 data.masks data.mask_use data.model data.images data.orient data.times data.time_pattern""".split()
-"""Settings that determine the planes, their frame and their content; paths do not count."""
+"""Settings that a resumed run must keep, because the planes and their frame depend on them."""
 
 
 def require_same_views(run: Path, record: Mapping[str, Any], views: Views) -> None:
@@ -52,8 +52,8 @@ def require_same_views(run: Path, record: Mapping[str, Any], views: Views) -> No
     recorded = files.get("train") if isinstance(files, Mapping) else None
     if isinstance(recorded, list) and recorded != list(views.files):
         raise ConfigError(
-            f"{run} was trained on {len(recorded)} views, but the scene now has {len(views.files)} "
-            f"views that differ from them in file or order: restore the scene's files"
+            f"{run} was trained on {len(recorded)} views; the scene now has {len(views.files)}, "
+            "with other files or in another order: restore the scene's files"
         )
 
 
@@ -136,14 +136,14 @@ def claim(run: Path, *, resume: bool) -> None:
         return  # The run ended before its first checkpoint: nothing is lost.
     if not resume:
         raise ConfigError(
-            f"{run} holds a run already ({status}). Resume it with {resume_command(run)}, "
+            f"{run} already holds a run ({status}). Resume it with {resume_command(run)}, "
             "or choose another hydra.run.dir"
             if status is not None
             else f"{run} holds checkpoints, but no run.json. Choose another hydra.run.dir"
         )
     if status is None:
         raise ConfigError(
-            f"resume={run}: there is no run.json, hence no run to resume; start one with "
+            f"resume={run}: there is no run.json, so no run to resume; start one with "
             f"hydra.run.dir={run} instead of resume"
         )
 
@@ -155,7 +155,7 @@ def _earlier(path: Path) -> dict[str, Any]:
     try:
         return read_json(path)
     except ValueError as problem:
-        logger.warning("%s: the record of this run starts again", problem)
+        logger.warning("%s: starting a new record of this run", problem)
         return {"resumed": 0}
 
 
@@ -229,7 +229,7 @@ def require_same_run(run: Path, config: Mapping[str, Any], max_steps: int) -> No
         done = load_checkpoint(run / "checkpoints" / LAST)["global_step"]
     if 0 <= max_steps < done:
         raise ConfigError(
-            f"trainer.max_steps={max_steps}: {run} has done {done} steps already. Set more, or "
+            f"trainer.max_steps={max_steps}: {run} has already done {done} steps. Set more, or "
             "leave it out"
         )
 

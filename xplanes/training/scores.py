@@ -107,7 +107,7 @@ def score_view(
 
 
 def gathered(scores: Sequence[ViewScore], trainer: Trainer) -> list[ViewScore]:
-    """The scores of all processes in the order of the views; each scores every n-th view.
+    """The scores of all processes in the order of the views; each process scores every n-th view.
 
     A process without a view repeats a view of another process; duplicates count once.
     """

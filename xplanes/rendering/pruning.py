@@ -61,9 +61,10 @@ def keep_moving(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
     Thin parts that move are learnt late, and their cells seem empty until then.
 
     Args:
-        grid: Changed in place. It is unchanged if more cells than `MOST_KEPT` would be kept: then
-            the light changes, or the images are noisy.
-        views: Training views; images with silhouettes or in files, and static scenes, keep none.
+        grid: Changed in place, unless a larger share of its cells than `MOST_KEPT` would be kept:
+            then the light changes, or the images are noisy.
+        views: Training views; not used if images have silhouettes or are in files, or all views
+            show one timestep.
         frame: The field's frame.
     """
     if views.is_stored or views.is_static or not views.is_opaque:

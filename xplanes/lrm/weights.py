@@ -96,7 +96,7 @@ def load_weights(
         # Weights of another published model are an error, even if a configuration exists.
         if problem.fits or not beside or source.weights is None:
             raise
-        announce(f"{path} has other sizes than published: using {beside[0]}")
+        announce(f"{path} does not have the published sizes: using {beside[0]}")
         return load(read_config(beside[0]), path)
 
 

@@ -218,4 +218,4 @@ def picture_crop(frames: Tensor, *, crop: bool) -> Crop:
     try:
         return foreground_crop(solid)
     except LRMError as problem:
-        raise LRMError(f"{problem}; set lrm.crop=false to show it whole") from None
+        raise LRMError(f"{problem}; set lrm.crop=false to use whole images") from None

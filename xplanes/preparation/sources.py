@@ -24,12 +24,7 @@ from xplanes.preparation.cache import Stage, StageCache
 from xplanes.preparation.fixed_view import given_video
 from xplanes.preparation.reconstruct import ImageLRMSettings, LoadedLRM, loaded, reconstruct
 from xplanes.preparation.sequence import TriplaneSequence, check_sequence, load_triplanes
-from xplanes.preparation.stages import (
-    convert_stage,
-    decompose_stage,
-    named_planes,
-    parts_sheet,
-)
+from xplanes.preparation.stages import convert_stage, decompose_stage, named_planes, parts_sheet
 from xplanes.scenes.views import Views
 from xplanes.settings import Location
 
@@ -56,9 +51,9 @@ class BundledLRMSettings(ImageLRMSettings):
                 raise LRMError(f"lrm.weights={own}: there is no such file")
             if own.suffix != ".safetensors":
                 raise LRMError(
-                    f"{own} is not a .safetensors file: name one that xplanes "
-                    "pretrain-lrm wrote, with its .json beside it, or say which published model "
-                    f"the weights belong to (lrm=large lrm.weights={own})"
+                    f"{own} is not a .safetensors file: give one that xplanes pretrain-lrm wrote, "
+                    "next to its .json, or name the published model to which the weights belong "
+                    f"(lrm=large lrm.weights={own})"
                 )
             model, path = load_bundled(own.stem, own.parent)
         return loaded(model, path, began)
@@ -128,7 +123,7 @@ class AutoInitialiser(LRMInitialiser):
             if scene.video is not None:
                 words = (
                     "the images of the fixed camera have no silhouettes for an LRM "
-                    "(preparation.fixed_view=video takes them all the same)"
+                    "(preparation.fixed_view=video uses them anyway)"
                 )
             words = f"random initialisation: {words}"
             return Initialisation(

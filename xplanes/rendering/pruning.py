@@ -1,7 +1,6 @@
 """Pruning of the occupancy grid before training: by silhouettes, and by an initialised field."""
 
 import math
-from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -12,7 +11,7 @@ from xplanes.rendering.marching import Rays, Samples, march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.matte import SOLID
-from xplanes.scenes.silhouettes import join_in_time, may_hold, moving
+from xplanes.scenes.silhouettes import enlarged, join_in_time, may_hold, moving
 from xplanes.scenes.views import Views
 
 MOST_KEPT = 0.2
@@ -191,12 +190,6 @@ def differing(values: Tensor) -> Tensor:
     """Pixels that are above 0 and differ from one of their neighbours. bool [H, W]"""
     most, least = (F.max_pool2d(sign * values[None], 3, 1, 1)[0] * sign for sign in (1, -1))
     return (values > 0) & (most != least)
-
-
-def enlarged(mask: Tensor, factor: int, size: Sequence[int]) -> Tensor:
-    """A mask enlarged by pixel replication and cropped to a size. bool [h, w] -> bool [H, W]"""
-    mask = mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
-    return mask[: size[0], : size[1]]
 
 
 def _samples(

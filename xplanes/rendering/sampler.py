@@ -13,14 +13,7 @@ from xplanes.errors import ConfigError, SceneError
 from xplanes.fields.base import RadianceField, Representation
 from xplanes.rendering.base import Renderer, Rendering
 from xplanes.scenes.batches import Batch
-from xplanes.scenes.frame import (
-    NO_HINTS,
-    CameraGroups,
-    CubeHints,
-    Frame,
-    cube_frame,
-    scene_frame,
-)
+from xplanes.scenes.frame import NO_HINTS, CameraGroups, CubeHints, Frame, cube_frame, scene_frame
 from xplanes.scenes.views import Views
 from xplanes.settings import Settings
 from xplanes.streams import TrainingState

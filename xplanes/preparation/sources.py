@@ -113,7 +113,7 @@ class LRMInitialiser(Initialiser):
 class AutoInitialiser(LRMInitialiser):
     """Triplanes of an LRM, or a random initialisation where a video would have to be rendered.
 
-    A field that renders one takes seconds, and the LRM then gains nothing: docs/decisions.md.
+    Training a field to render one takes seconds, which cancels the LRM's gain: docs/decisions.md.
     """
 
     def initialise(self, method: Method, place: Place) -> Initialisation:
@@ -175,14 +175,14 @@ def cache_of(method: Method, place: Place) -> StageCache:
     if place.devices > 1 and folder is None:
         raise ConfigError(
             f"preparation.cache=null with lrm={method.lrm.name} and trainer.devices="
-            f"{place.devices}: the processes share the initialisation through the cache; name a "
-            "folder"
+            f"{place.devices}: the processes share the initialisation through the cache; set "
+            "it to a folder"
         )
     cache = StageCache(None if folder is None else Path(folder))
     if place.devices > 1 and not cache.writable:
         raise ConfigError(
             f"preparation.cache={folder} cannot be written, and the {place.devices} processes "
-            "share the initialisation through it: name another folder"
+            "share the initialisation through it: set another folder"
         )
     return cache
 
@@ -301,6 +301,6 @@ def _described(
         )
     else:
         words.append("no time planes")
-    words.append("its decoder" if sequence.decoder is not None else "a fresh decoder")
-    words.append("its frame" if sequence.frame is not None else "the scene's frame")
+    words.append("given decoder" if sequence.decoder is not None else "new decoder")
+    words.append("given frame" if sequence.frame is not None else "the scene's frame")
     return " · ".join(words)

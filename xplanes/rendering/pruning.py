@@ -55,7 +55,7 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame, *, exact: bool = True
 
 
 def keep_moving(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
-    """Keep cells occupied in which every fixed camera that sees them shows a change.
+    """Keep the cells occupied in which all fixed cameras that see them show a change.
 
     Thin parts that move are learnt late, and their cells seem empty until then.
 

@@ -216,7 +216,7 @@ def changing(views: Views, margins: Sequence[int]) -> Tensor | None:
 def moving(
     views: Views, points: Tensor, *, radius: float, bins: Tensor, count: int
 ) -> Tensor | None:
-    """Points around which every fixed camera that sees them, two at least, shows a change.
+    """Points around which all fixed cameras that see them, at least two, show a change.
 
     Points that a static object hides from one camera are not found. Cameras that move or have few
     images are left out. Images are compared at half their size.

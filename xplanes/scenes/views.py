@@ -432,7 +432,7 @@ class Views:
 
 
 def joined(first: Views, second: Views) -> Views:
-    """The views of both."""
+    """The views of both, without ``foreground``."""
     height, width = max(first.height, second.height), max(first.width, second.width)
 
     def together(parts: Sequence[Tensor]) -> Tensor:

@@ -281,7 +281,7 @@ def images(
     try:
         require_writable(folder)
     except StorageError as problem:
-        raise StorageError(f"{problem}: set data.cache to another folder") from problem
+        raise StorageError(f"{problem}; data.cache sets the folder of decoded images") from problem
     with in_turn(path.with_suffix(".lock")) as alone:
         if (ready := stored()) is not None:
             return ready

@@ -191,8 +191,8 @@ class Views:
         size = self.intrinsics.size
         if len(size) != count or (count and size.amax(dim=0).tolist() != [height, width]):
             raise ValueError(
-                f"views.images is {list(self.images.shape)}, but views.intrinsics has {len(size)} "
-                f"images of at most {size.amax(dim=0).tolist() if len(size) else 0} pixels"
+                f"views.images is {list(self.images.shape)}, which does not fit views.intrinsics: "
+                f"{len(size)} images of at most {size.amax(dim=0).tolist() if len(size) else 0} px"
             )
         for name in ("foreground", "ignored"):
             pixels: Tensor | None = getattr(self, name)

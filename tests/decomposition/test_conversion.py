@@ -41,7 +41,7 @@ def test_another_resolution_samples_the_same_function():
 def test_oblong_triplanes_become_square_planes():
     low = torch.randn(3, 3, 2, 6, 10)
     assert space_planes(low, resolution=8).shape == (3, 8, 8, 2)
-    with pytest.raises(ValueError, match="name a resolution"):
+    with pytest.raises(ValueError, match="set a resolution"):
         space_planes(low)
 
 

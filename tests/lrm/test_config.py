@@ -27,7 +27,7 @@ def test_published_sizes():
     ):
         config = parse_config(published_config(name))
         assert (config.image_size, config.heads, config.head_width) == (size, heads, 64), name
-        assert config.resolution == 64, name
+        assert config.low_resolution == 32, name
         assert config.encoder.width // config.encoder.heads == 64, name
 
 
@@ -35,7 +35,7 @@ def test_references_are_followed():
     assert parse_config(CONFIGS["triposr"]).width == 64
     for value, message in (
         ("${tokenizer.absent}", "does not exist"),
-        ("${backbone.in_channels}", "circle"),
+        ("${backbone.in_channels}", "circular"),
         ("${oc.env:HOME}", "in_channels"),
     ):
         backbone = {**CONFIGS["triposr"]["backbone"], "in_channels": value}

@@ -137,6 +137,6 @@ def test_a_triplane_that_is_not_finite_is_refused_and_not_kept(tmp_path, monkeyp
     original = model.encode
     with monkeypatch.context() as patch:
         patch.setattr(model, "encode", lambda images, *rest: original(images, *rest) * float("inf"))
-        with pytest.raises(LRMError, match=r"NaN or infinity of frame 0"):
+        with pytest.raises(LRMError, match=r"NaN or infinity for frame 0"):
             run(model, frames, cache)
     assert run(model, frames, cache).cached == 0

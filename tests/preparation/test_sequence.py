@@ -100,7 +100,7 @@ def framed(**changes: object) -> dict:
 
 WRONG = {
     "list": ([1, 2], "must be a dict"),
-    "no triplanes": ({"planes": GOOD}, "planes: there must be a dict with the key triplanes"),
+    "no triplanes": ({"planes": GOOD}, "planes: it must be a dict with the key triplanes"),
     "unknown key": ({"triplanes": GOOD, "colour": 1}, "unknown keys colour"),
     "no tensor": ({"triplanes": [1.0]}, "triplanes are list"),
     "integers": ({"triplanes": GOOD.int()}, "torch.int32"),

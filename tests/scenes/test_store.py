@@ -428,6 +428,6 @@ def test_a_cache_that_cannot_be_written_is_read_or_named(paths, cache, monkeypat
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     for home in (lambda: paths[0], homeless):
         monkeypatch.setattr(Path, "home", home)
-        with pytest.raises(StorageError, match=r"cannot be written: .*data\.cache names the one"):
+        with pytest.raises(StorageError, match=r"cannot be written: .*data\.cache sets"):
             read_images(paths)
     assert read_images(paths, cache=cache)[0].image(0).shape == (65, 65, 4)

@@ -22,7 +22,7 @@ CHANGE_OVER_TOLERANCE = 10.0  # Ratio of the bounds on relative change and resid
 _RELAXATION = 1.6
 """Over-relaxation of the low-rank part; 1 is plain ADMM."""
 _WARM_UP, _WARM_STEP = 10, 3.0
-"""Iterations that set the penalty from the norms, and largest factor on it in one of them."""
+"""Iterations that set the penalty from the norms, and its largest factor per iteration."""
 _RATIO = 1.5
 """Target of ``penalty * |S| / |multiplier|`` in these iterations."""
 _GROWTH = 1.2

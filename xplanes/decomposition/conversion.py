@@ -62,8 +62,8 @@ _SWEEPS = 15  # Passes of alternating least squares over all factors.
 def rank1_factors(planes: Tensor) -> tuple[Tensor, Tensor]:
     """Best rank-1 product of every slice: the minimiser of the product loss for nine planes.
 
-    Power iteration, initialised with the longest row; slices of zeros stay zero. The signs of each
-    pair follow the previous frame, so that interpolation in time does not pass through zero.
+    Power iteration, initialised with the row of largest norm; slices of zeros stay zero. The signs
+    of each pair follow the previous frame, so that interpolation in time does not cross zero.
 
     Args:
         planes: One orientation of the sparse part. [T, C, H, W]
@@ -349,7 +349,7 @@ def _resolution(triplanes: Tensor, resolution: int | None) -> int:
     height, width = triplanes.shape[-2:]
     if resolution is None:
         if height != width:
-            raise ValueError(f"triplanes are {height} x {width}: name a resolution")
+            raise ValueError(f"triplanes are {height} x {width}: set a resolution")
         return height
     if resolution < 1:
         raise ValueError(f"resolution is {resolution}: it must be at least 1")

@@ -11,12 +11,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from xplanes.decomposition.admm import (
-    CHANGE_OVER_TOLERANCE,
-    Progress,
-    block_rows,
-    minimise,
-)
+from xplanes.decomposition.admm import CHANGE_OVER_TOLERANCE, Progress, block_rows, minimise
 from xplanes.fields.xplanes import SPACE_PLANES
 
 METHODS = ("adaptive", "admm")

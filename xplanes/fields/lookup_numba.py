@@ -107,7 +107,7 @@ def scatter_space(points, gradient, tasks, space):
 
     Each row adds the points in order, so that sums do not depend on the number of tasks.
     """
-    if tasks == 1:  # A tenth faster without the test of a row's owner.
+    if tasks == 1:  # Without the test for a row's owner, this is 10% faster.
         scatter_planes(points, gradient, space)
     else:
         scatter_rows(points, gradient, tasks, space)

@@ -72,7 +72,7 @@ class XPlanes(RadianceField):
         if set(planes) != {*SPACE_PLANES, *names, *(FINE_PLANES if fine else ())}:
             raise ValueError(
                 f"planes are {', '.join(sorted(planes))}: plane_set={plane_set!r} needs "
-                f"{', '.join((*SPACE_PLANES, *names))}, and takes {', '.join(FINE_PLANES)}"
+                f"{', '.join((*SPACE_PLANES, *names))}, and may have {', '.join(FINE_PLANES)}"
             )
         self.space = nn.Parameter(_stack(planes, SPACE_PLANES))
         self.time = nn.Parameter(_stack(planes, names)) if names else None

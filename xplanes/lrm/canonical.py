@@ -6,8 +6,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-Rows = tuple[tuple[float, float, float], ...]
-
 
 @dataclass(frozen=True)
 class CanonicalView:
@@ -21,7 +19,7 @@ class CanonicalView:
         background: Grey value, from 0 to 1, behind the object in the model's input.
     """
 
-    rotation: Rows
+    rotation: tuple[tuple[float, float, float], ...]
     distance: float
     focal: float
     half_side: float

@@ -174,11 +174,6 @@ class LRMConfig:
     source_focal: float = OPENLRM_VIEW.focal
     density_scale: float = 1.0
 
-    @property
-    def resolution(self) -> int:
-        """Texels along each side of a plane."""
-        return 2 * self.low_resolution
-
 
 @dataclass(frozen=True)
 class Reader:
@@ -253,7 +248,7 @@ class Reader:
                     )
                 found = found[name]
             value = found
-        raise LRMError(f"the model's configuration refers to {value} in a circle")
+        raise LRMError(f"the model's configuration has a circular reference: {value}")
 
 
 def parse_config(config: Mapping[str, Any]) -> LRMConfig:
@@ -316,7 +311,7 @@ SOURCE_SIZES = {512: 224, 768: 336, 1024: 448}
 def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig:
     nested = isinstance(config.get("model"), Mapping)
     model = Reader(config).inner("model") if nested else Reader(config)
-    # Keys that published files lack may be written beside the section of the model, or in it.
+    # Keys that published files lack may be given inside or outside the section "model".
     given = Reader({**config, **model.values})
     sizes = _encoder_sizes(given)
     width, low = model.integer("transformer_dim"), model.integer("triplane_low_res")

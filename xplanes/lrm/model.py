@@ -73,7 +73,7 @@ class LRM(nn.Module):
         raise NotImplementedError
 
     def prepare(self, rgba: Tensor) -> Tensor:
-        """Preprocess RGBA images for the model. [N, 4, H, W] -> [N, 3, S, S]
+        """Preprocess RGBA images for the model.
 
         Args:
             rgba: Images with straight (not premultiplied) alpha; uint8, or floats in [0, 1].

@@ -27,7 +27,7 @@ PATIENCE_SECONDS = 3.0
 
 
 def answers(url: str) -> bool:
-    """Whether a server, or the environment's proxy to it, accepts a connection in time.
+    """Whether a server, or the proxy to it, accepts a connection within `PATIENCE_SECONDS`.
 
     Checked before a download, because the hub's own client retries for half a minute.
 
@@ -96,7 +96,7 @@ def load_weights(
         # Weights of another published model are an error, even if a configuration exists.
         if problem.fits or not beside or source.weights is None:
             raise
-        announce(f"{path} has other sizes than published: using {beside[0]}")
+        announce(f"{path} does not have the published sizes: using {beside[0]}")
         return load(read_config(beside[0]), path)
 
 
@@ -214,6 +214,6 @@ def load_bundled(name: str, folder: Path = FOLDER) -> tuple[LRM, Path]:
     if found != expected:
         raise LRMError(
             f"{path} is damaged or belongs to another model: its SHA-256 begins with {found[:12]}, "
-            f"{described.name} says {str(expected)[:12]}; reinstall the package"
+            f"{described.name} says {str(expected)[:12]}; restore both files"
         )
     return load(config, path), path

@@ -150,18 +150,18 @@ def _find(path: Path | None, key: str) -> Stage | None:
     try:
         payload = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(payload, dict):
-            problem = "no entry of this cache"
+            problem = "not an entry of this cache"
         elif payload.get("version") != VERSION:
             problem = f"of version {payload.get('version')}, not {VERSION}"
         elif payload.get("key") != key:
-            problem = "that of other inputs"
+            problem = "the entry of other inputs"
         elif payload["checksum"] != fingerprint([payload["content"], payload["seconds"]]):
             problem = "damaged (wrong checksum)"
         else:
             return Stage(payload["content"], payload["seconds"], True, key)
     except Exception as error:  # A damaged file raises many kinds of errors.
         problem = f"damaged ({type(error).__name__})"
-    logger.warning("%s is %s: it is computed again", path, problem)
+    logger.warning("%s is %s: it is recomputed", path, problem)
     return None
 
 

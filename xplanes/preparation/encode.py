@@ -96,8 +96,8 @@ def encode(
             )
         if not bool(planes.isfinite().all()):
             raise LRMError(
-                f"the LRM makes NaN or infinity of frame {int(first[0])} or a later one: its "
-                f"weights do not work{' in bfloat16; set lrm.precision=32' if bf16 else ''}"
+                f"the LRM predicts NaN or infinity for frame {int(first[0])} or a later one: its "
+                f"weights are unusable{' in bfloat16; set lrm.precision=32' if bf16 else ''}"
             )
         share = (time.perf_counter() - began) / len(chunk)
         for frame_key, triplane in zip(chunk, planes, strict=True):

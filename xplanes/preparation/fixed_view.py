@@ -264,8 +264,8 @@ def _rendered(
                 folder,
                 steps=options.fixed_view_steps,
                 seconds=options.fixed_view_seconds,
-                advice=f"It belongs to {options.fixed_view_model}, which was to render the fixed "
-                "view: set preparation.fixed_view_model to another model, or lrm=none",
+                advice=f"The model {options.fixed_view_model} renders the fixed view: set "
+                "preparation.fixed_view_model to another model, or lrm=none",
             )
             return {"images": _render(module, own_frame, pose, focal, side, count, back)}
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from xplanes.backend import fast_bf16
 from xplanes.errors import ConfigError, LRMError
-from xplanes.lrm.alignment import Alignment, align, fit_cube
+from xplanes.lrm.alignment import Alignment, Matching, align, fit_cube
 from xplanes.lrm.images import Crop, foreground_crop, square_crop
 from xplanes.lrm.model import LRM
 from xplanes.models.initialisation import InitialiserSettings, Method, Place
@@ -69,7 +69,7 @@ class ImageLRMSettings(InitialiserSettings, ABC):
 
     weights: Location | None  # Local file of weights; null: downloaded or bundled weights.
     # If focal lengths differ from the LRM's. scale: match sizes at the scene's depth; pad: exact.
-    matching: Literal["scale", "pad"]
+    matching: Matching
     crop: bool  # Crop images to the object size in the LRM's training.
     batch: Count  # Images per batch.
     precision: Literal["auto", "32", "bf16"]  # Precision of matrix products; auto: bf16 if fast.
@@ -218,4 +218,4 @@ def picture_crop(frames: Tensor, *, crop: bool) -> Crop:
     try:
         return foreground_crop(solid)
     except LRMError as problem:
-        raise LRMError(f"{problem}; set lrm.crop=false to show it whole") from None
+        raise LRMError(f"{problem}; set lrm.crop=false to use whole images") from None

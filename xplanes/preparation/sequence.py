@@ -125,7 +125,7 @@ def load_triplanes(path: Path) -> TriplaneSequence:
         ) from error
     if not isinstance(content, dict) or "triplanes" not in content:
         found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content)
-        raise ConfigError(f"{path} holds {found}: there must be a dict with the key triplanes")
+        raise ConfigError(f"{path} holds {found}: it must be a dict with the key triplanes")
     if unknown := set(content) - _KEYS:
         names = ", ".join(sorted(map(str, unknown)))
         raise ConfigError(f"{path}: unknown keys {names}; allowed are {', '.join(sorted(_KEYS))}")
@@ -159,7 +159,7 @@ def check_sequence(sequence: TriplaneSequence, name: str) -> None:
     if len(shape) != 5 or shape[1] != 3 or 0 in shape or shape[3] != shape[4]:
         raise ConfigError(
             f"{name}: triplanes are {shape}, but must be [T, 3, C, H, H]: timesteps, planes xy, xz "
-            "and yz, channels, rows and as many columns"
+            "and yz, channels, and equally many rows and columns"
         )
     for number, frame in enumerate(planes):
         if not frame.float().isfinite().all():  # Checked in the computation type.

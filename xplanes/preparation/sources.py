@@ -24,12 +24,7 @@ from xplanes.preparation.cache import Stage, StageCache
 from xplanes.preparation.fixed_view import given_video
 from xplanes.preparation.reconstruct import ImageLRMSettings, LoadedLRM, loaded, reconstruct
 from xplanes.preparation.sequence import TriplaneSequence, check_sequence, load_triplanes
-from xplanes.preparation.stages import (
-    convert_stage,
-    decompose_stage,
-    named_planes,
-    parts_sheet,
-)
+from xplanes.preparation.stages import convert_stage, decompose_stage, named_planes, parts_sheet
 from xplanes.scenes.views import Views
 from xplanes.settings import Location
 
@@ -56,9 +51,9 @@ class BundledLRMSettings(ImageLRMSettings):
                 raise LRMError(f"lrm.weights={own}: there is no such file")
             if own.suffix != ".safetensors":
                 raise LRMError(
-                    f"{own} is not a .safetensors file: name one that xplanes "
-                    "pretrain-lrm wrote, with its .json beside it, or say which published model "
-                    f"the weights belong to (lrm=large lrm.weights={own})"
+                    f"{own} is not a .safetensors file: give one that xplanes pretrain-lrm wrote, "
+                    "next to its .json, or name the published model to which the weights belong "
+                    f"(lrm=large lrm.weights={own})"
                 )
             model, path = load_bundled(own.stem, own.parent)
         return loaded(model, path, began)
@@ -118,7 +113,7 @@ class LRMInitialiser(Initialiser):
 class AutoInitialiser(LRMInitialiser):
     """Triplanes of an LRM, or a random initialisation where a video would have to be rendered.
 
-    A field that renders one takes seconds, and the LRM then gains nothing: docs/decisions.md.
+    Training a field to render one takes seconds, which cancels the LRM's gain: docs/decisions.md.
     """
 
     def initialise(self, method: Method, place: Place) -> Initialisation:
@@ -128,7 +123,7 @@ class AutoInitialiser(LRMInitialiser):
             if scene.video is not None:
                 words = (
                     "the images of the fixed camera have no silhouettes for an LRM "
-                    "(preparation.fixed_view=video takes them all the same)"
+                    "(preparation.fixed_view=video uses them anyway)"
                 )
             words = f"random initialisation: {words}"
             return Initialisation(
@@ -180,14 +175,14 @@ def cache_of(method: Method, place: Place) -> StageCache:
     if place.devices > 1 and folder is None:
         raise ConfigError(
             f"preparation.cache=null with lrm={method.lrm.name} and trainer.devices="
-            f"{place.devices}: the processes share the initialisation through the cache; name a "
-            "folder"
+            f"{place.devices}: the processes share the initialisation through the cache; set "
+            "it to a folder"
         )
     cache = StageCache(None if folder is None else Path(folder))
     if place.devices > 1 and not cache.writable:
         raise ConfigError(
             f"preparation.cache={folder} cannot be written, and the {place.devices} processes "
-            "share the initialisation through it: name another folder"
+            "share the initialisation through it: set another folder"
         )
     return cache
 
@@ -306,6 +301,6 @@ def _described(
         )
     else:
         words.append("no time planes")
-    words.append("its decoder" if sequence.decoder is not None else "a fresh decoder")
-    words.append("its frame" if sequence.frame is not None else "the scene's frame")
+    words.append("given decoder" if sequence.decoder is not None else "new decoder")
+    words.append("given frame" if sequence.frame is not None else "the scene's frame")
     return " · ".join(words)

@@ -8,12 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from xplanes.decomposition import (
-    decompose,
-    space_planes,
-    time_planes,
-    unexplained_energy,
-)
+from xplanes.decomposition import decompose, space_planes, time_planes, unexplained_energy
 from xplanes.fields.xplanes import PLANE_SETS, SPACE_PLANES, TIME_PLANES
 from xplanes.lrm.images import Crop
 from xplanes.lrm.model import LRM
@@ -80,17 +75,8 @@ def contact_sheet(frames: Tensor, crop: Crop, model: LRM) -> Tensor:
 
 
 REPORTED = (
-    "rank",
-    "iterations",
-    "residual",
-    "change",
-    "converged",
-    "sparsity",
-    "drift",
-    "low_rank_energy",
-    "sparse_energy",
-    "sparsity_weight",
-    "unit",
+    *("rank", "iterations", "residual", "change", "converged", "sparsity", "drift"),
+    *("low_rank_energy", "sparse_energy", "sparsity_weight", "unit"),
 )
 """Entries of metrics.json for each orientation."""
 
@@ -112,17 +98,8 @@ def decompose_stage(
         ``sparse`` is None and the report is empty.
     """
     triplanes = triplanes.float()
-    options = {
-        name: getattr(config, name)
-        for name in (
-            "method",
-            "sparsity_weight",
-            "penalty",
-            "scale",
-            "tolerance",
-            "max_iterations",
-        )
-    }
+    names = ("method", "sparsity_weight", "penalty", "scale", "tolerance", "max_iterations")
+    options = {name: getattr(config, name) for name in names}
     if len(triplanes) == 1:
         content = {"low_rank": triplanes, "sparse": None, "report": {}}
         return cache.stage("decomposition", [triplanes, options], lambda: content, keep=False)

@@ -126,13 +126,13 @@ class RayRenderer(Renderer):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Colour, opacity and depth of rays without gradients. [R, 3], [R], [R]
 
-        A renderer overrides this if images cost less to render than training batches.
+        Overridden by renderers for which images are cheaper than training batches.
         """
         seen = self.render(field, origins, directions, times, background)
         return seen.colour, seen.opacity, seen.depth
 
     def for_image(self, field: Any, time: float, rays: int) -> "RayRenderer":
-        """The renderer of an image, of the same kind; itself by default.
+        """The renderer to use for an image; itself by default.
 
         Args:
             field: The field, or its snapshot at that time.

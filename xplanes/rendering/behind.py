@@ -35,8 +35,8 @@ def behind(
         field: A field whose ``background`` is a `Background`, None or missing.
         origins: Ray origins in the field's frame. [R, 3]
         directions: Unit directions. [R, 3]
-        opacity: Opacity of the field along each ray. Behind opaque rays no background is computed;
-            it is black. [R]
+        opacity: Opacity of the field along each ray. The background behind opaque rays is black,
+            not computed. [R]
         constant: Colour behind a field without a background. [3] or [R, 3]
         jitter: Offset of each ray's samples within their steps; the middle when None. [R]
         ends: Intersects rays with the field's box.
@@ -49,7 +49,7 @@ def behind(
         return constant
     clear = opacity.detach() < 1 - DARK
     if clear.device.type != "cpu":
-        # Selecting the rays would wait for the device.
+        # Selecting the rays would make the host wait for the device.
         return torch.where(
             clear[:, None], background_colour(background, origins, directions, jitter, ends), 0
         )
@@ -69,8 +69,8 @@ def background_colour(
 ) -> Tensor:
     """Colours of a background along rays, from their exit from the field's box to infinity.
 
-    Samples are uniform in inverse distance, and the last one, at infinity, is opaque. On a ray that
-    misses the box they begin at half its origin's distance from the frame's centre.
+    Samples are uniform in inverse distance, and the last one, at infinity, is opaque. On rays that
+    miss the box, they start at half the distance between ray origin and frame centre.
 
     Args:
         background: The background.

@@ -26,7 +26,7 @@ def composite(
     """Composite the samples of each ray (Beer-Lambert law).
 
     Each ray has weights ``w_i = exp(-sum_{j<i} tau_j) (1 - exp(-tau_i))``, from sums of optical
-    depths: no finite depth of at least 0 gives NaN or infinity. A NaN depth makes its ray NaN.
+    depths: finite depths of at least 0 never give NaN or infinity. A NaN depth makes its ray NaN.
     Gradients reach depths and colours. Computed by compiled loops on the CPU, by Triton kernels on
     CUDA if they pass their trial, and otherwise by `composite_reference`.
 
@@ -95,7 +95,7 @@ def depth_before(optical_depth: Tensor, ray: Tensor, starts: Tensor) -> Tensor:
     """
     depth = optical_depth.double()
     total = depth.cumsum(0) - depth
-    # Not by indexing, whose backward sorts the indices on a GPU: 3 ms for a batch.
+    # The backward of indexing sorts the indices on a GPU, which takes 3 ms per batch.
     return total - total.index_select(0, starts[ray])
 
 

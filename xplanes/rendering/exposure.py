@@ -55,7 +55,7 @@ class ExposureSampler(WrappingSampler):
             return rendering
         gains = self.exposures(rays["view"])
         if (shown := rendering.shown) is not None:
-            # The colour of a ray without slots is that of the background alone.
+            # A ray without slots shows only the background.
             gains = torch.where(shown[:, None], gains, gains.detach())
         return replace(rendering, colour=rendering.colour * gains)
 
@@ -93,5 +93,5 @@ class Exposures(nn.Module):
 
     def forward(self, view: Tensor) -> Tensor:
         """Gains of rays by their training views. int64 [R] -> [R, 3]"""
-        # Not by indexing, see `depth_before`.
+        # Faster than indexing, see `depth_before`.
         return self.relative.index_select(0, self.index[view]).exp()

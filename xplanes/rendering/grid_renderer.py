@@ -39,18 +39,18 @@ BINS, MOST_BINS = 8, 16
 """Usual and maximum number of time bins of the grid with time_bins=auto."""
 
 UNPRUNED = 0.9
-"""Share of occupied cells above which an image searches for empty space first."""
+"""Share of occupied cells above which empty space is searched for before rendering an image."""
 
 HALF_EMPTY = 0.4
-"""Share of occupied cells above which a field is too smooth for images to gain from many more
-samples than training batches have."""
+"""Share of occupied cells above which a field is too smooth for images to need many more samples
+than training batches."""
 
 DETAILED = 1.5
-"""How many times the samples of training batches images have at most until then, in scenes with
-surroundings that are seen from many camera positions."""
+"""Largest number of samples of such images, relative to training batches, in scenes with
+surroundings and many camera positions."""
 
 SEARCHED_PER_RAY = 8
-"""Cells per ray that an image searches for empty space at most, if nothing is pruned yet."""
+"""Largest number of cells per ray of an image that are searched for empty space."""
 
 SPARSE_POINTS = 2048
 """Points at which the sparsity prior is evaluated."""
@@ -228,20 +228,20 @@ class OccupancySettings(SamplerSettings):
     # Samples along the diagonal of the cube in training. auto: half the number of image pixels
     # along its side, from 128 to 256; 128 in scenes with surroundings.
     samples: Count | Literal["auto"]
-    # Samples along the diagonal in evaluation and videos; as many as in training while two fifths
-    # of the cells are occupied, or one and a half times as many while nine tenths are not in scenes
-    # with surroundings that are seen from at least 50 camera positions.
+    # Samples along the diagonal in evaluation and videos. No more than in training while over 40%
+    # of the cells are occupied; up to 1.5 times as many between 40% and 90% in scenes with
+    # surroundings and at least 50 camera positions.
     render_samples: Count
     grid_resolution: Count  # Cells of the occupancy grid along each side.
-    # Bins of the occupancy grid along time. auto: 8; one per timestep, up to 16, if four or more
-    # views show each.
+    # Bins of the occupancy grid along time. auto: one per timestep, from 8 to 16, if there are four
+    # or more views per timestep, else 8.
     time_bins: Count | Literal["auto"]
     threshold: Fraction  # Opacity per step below which a cell is empty.
     # Replaces `model.sampler.threshold` if a background is learnt.
     threshold_with_background: Fraction
     decay: Share  # Decay of a cell's density at each update.
-    # Replaces `model.sampler.decay` if a background is learnt. Most observations of a cell that
-    # something thin crosses lie beside it.
+    # Replaces `model.sampler.decay` if a background is learnt. In a cell with a thin part, most
+    # observations miss that part.
     decay_with_background: Share
     skip_empty: bool  # Skip samples in empty cells.
     skip_occluded: bool  # Skip samples behind opaque surfaces.
@@ -332,7 +332,7 @@ class OccupancySettings(SamplerSettings):
         return OccupancySampler(renderer, settings, site.samples_per_batch, fill_seconds, filled)
 
     def with_constant_background(self, site: Site) -> "OccupancySettings":
-        """Settings for a constant background: sweeps scaled to the batch size, no losses of fog.
+        """Settings for a constant background: scaled sweeps, no losses against fog.
 
         Updates of random cells are not scaled, because large batches reach more cells anyway.
         """
@@ -428,7 +428,7 @@ class OccupancySampler(Sampler):
 
     def render(self, field: Any, rays: Batch, state: TrainingState) -> Rendering:
         renderer = self._training_renderer
-        # On a GPU the number of slots would not follow when the number of samples doubles.
+        # On a GPU, the number of slots would not adapt when the number of samples doubles.
         on_cpu = self.device.type == "cpu"
         if on_cpu and self.settings.coarse_first and state.step < self.pruned_at:
             renderer = replace(renderer, samples=max(1, renderer.samples // 2))

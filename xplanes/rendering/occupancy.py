@@ -110,7 +110,7 @@ class OccupancyGrid(nn.Module):
         self._mark()
 
     def _mark(self) -> None:
-        """Mark the cells that are occupied, all of them."""
+        """Recompute ``occupied`` for all cells."""
         torch.gt(self.density, self.empty_density, out=self.occupied)
         self.occupied.logical_or_(self.kept)
 
@@ -224,7 +224,7 @@ class OccupancyGrid(nn.Module):
 
         Args:
             field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
-            uniform: Numbers from 0 to 1, eight for each cell at most. [N, 8]
+            uniform: Random numbers from 0 to 1 for up to N cells. [N, 8]
         """
         count, total = len(uniform), self.density.numel()
         chosen = uniform[:, 0]
@@ -303,5 +303,5 @@ class OccupancyGrid(nn.Module):
 
 
 def _without_kept(grid: OccupancyGrid, state: dict[str, Tensor], prefix: str, *_: object) -> None:
-    """Checkpoints from before cells were kept leave those of the grid as they are."""
+    """Load older checkpoints, which lack ``kept``, without changing it."""
     state.setdefault(f"{prefix}kept", grid.kept)

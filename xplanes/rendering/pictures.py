@@ -13,7 +13,7 @@ from xplanes.files import replacing
 _RAMP = torch.tensor(
     [[13, 8, 135], [126, 3, 168], [204, 71, 120], [248, 149, 64], [240, 249, 33]]
 ).div(255)
-"""Five colours from dark blue over magenta to yellow, evenly spaced in lightness."""
+"""Five colours from dark blue via magenta to yellow, evenly spaced in lightness."""
 
 
 def colour_map(values: Tensor) -> Tensor:
@@ -54,13 +54,11 @@ def strip(truth: Tensor, colour: Tensor, depth: Tensor, opacity: Tensor) -> Tens
     return torch.cat([truth, colour, error, depth_picture(depth, opacity)], dim=1)
 
 
-def plane_sheet(planes: Mapping[str, Tensor], columns: int = 3, side: int = 128) -> Tensor:
-    """Feature planes as pictures, three channels of each as colours, in rows of ``columns``.
+def plane_sheet(planes: Mapping[str, Tensor]) -> Tensor:
+    """Feature planes as pictures, three channels of each as colours, three pictures per row.
 
     Args:
         planes: Planes by name. [C, rows, columns] each
-        columns: Pictures per row.
-        side: Pixels per picture.
 
     Returns:
         One picture. [H, W, 3]
@@ -71,11 +69,11 @@ def plane_sheet(planes: Mapping[str, Tensor], columns: int = 3, side: int = 128)
         shown = torch.cat([shown, shown[:1].expand(3 - len(shown), -1, -1)])
         spread = 2.5 * shown.std().clamp_min(1e-8)
         shown = ((shown - shown.mean()) / (2 * spread) + 0.5).clamp(0, 1)
-        tile = F.interpolate(shown[None], size=(side, side), mode="nearest")[0].permute(1, 2, 0)
+        tile = F.interpolate(shown[None], size=(128, 128), mode="nearest")[0].permute(1, 2, 0)
         tiles.append(F.pad(tile, (0, 0, 2, 2, 2, 2), value=1.0))
-    while len(tiles) % columns:
+    while len(tiles) % 3:
         tiles.append(torch.ones_like(tiles[0]))
-    rows = [torch.cat(tiles[i : i + columns], dim=1) for i in range(0, len(tiles), columns)]
+    rows = [torch.cat(tiles[i : i + 3], dim=1) for i in range(0, len(tiles), 3)]
     return torch.cat(rows)
 
 

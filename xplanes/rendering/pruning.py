@@ -1,7 +1,6 @@
 """Pruning of the occupancy grid before training: by silhouettes, and by an initialised field."""
 
 import math
-from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -12,7 +11,7 @@ from xplanes.rendering.marching import Rays, Samples, march
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.matte import SOLID
-from xplanes.scenes.silhouettes import join_in_time, may_hold, moving
+from xplanes.scenes.silhouettes import enlarged, join_in_time, may_hold, moving
 from xplanes.scenes.views import Views
 
 MOST_KEPT = 0.2
@@ -56,14 +55,15 @@ def carve(grid: OccupancyGrid, views: Views, frame: Frame, *, exact: bool = True
 
 
 def keep_moving(grid: OccupancyGrid, views: Views, frame: Frame) -> None:
-    """Keep cells occupied in which every fixed camera that sees them shows a change.
+    """Keep the cells occupied in which all fixed cameras that see them show a change.
 
     Thin parts that move are learnt late, and their cells seem empty until then.
 
     Args:
-        grid: Changed in place. It is unchanged if more cells than `MOST_KEPT` would be kept: then
-            the light changes, or the images are noisy.
-        views: Training views; images with silhouettes or in files, and static scenes, keep none.
+        grid: Changed in place, unless a larger share of its cells than `MOST_KEPT` would be kept:
+            then the light changes, or the images are noisy.
+        views: Training views; not used if images have silhouettes or are in files, or all views
+            show one timestep.
         frame: The field's frame.
     """
     if views.is_stored or views.is_static or not views.is_opaque:
@@ -190,12 +190,6 @@ def differing(values: Tensor) -> Tensor:
     """Pixels that are above 0 and differ from one of their neighbours. bool [H, W]"""
     most, least = (F.max_pool2d(sign * values[None], 3, 1, 1)[0] * sign for sign in (1, -1))
     return (values > 0) & (most != least)
-
-
-def enlarged(mask: Tensor, factor: int, size: Sequence[int]) -> Tensor:
-    """A mask enlarged by pixel replication and cropped to a size. bool [h, w] -> bool [H, W]"""
-    mask = mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
-    return mask[: size[0], : size[1]]
 
 
 def _samples(

@@ -42,7 +42,7 @@ LEAST_RAYS = 100.0
 """Rays that a camera needs to be corrected, weighted by opacity."""
 
 LEAST_AREA = 1e-3
-"""Minimum squared sine of the angle between a direction's changes per pixel right and down."""
+"""Minimum squared sine of the angle between the changes of a ray per pixel right and down."""
 
 BEHIND = 3.0
 """Assumed distance of the surroundings from the cube's centre, in units of half its side."""
@@ -108,7 +108,7 @@ class CameraCorrections(nn.Module):
     """
 
     own = ("steepness", "residual", "pixels", "rays")
-    """Buffers that each process of a distributed run has for itself."""
+    """Buffers that differ between the processes of a distributed run."""
 
     index: Tensor
     places: Tensor
@@ -200,7 +200,7 @@ class CameraCorrections(nn.Module):
     def solve(self) -> None:
         """Correct the cameras that enough rays have observed since their last correction.
 
-        Their observations are cleared; those of the others are kept until they suffice.
+        Their sums are cleared; the other cameras keep theirs until they have enough rays.
         """
         sums = (self.steepness, self.residual, self.pixels, self.rays)
         if in_group():
@@ -223,7 +223,7 @@ class CameraCorrections(nn.Module):
         self.motion.copy_(motion)
         self.moved.copy_(torch.where(known, _displacement(motion, metric), self.moved))
         first = not in_group() or distributed.get_rank() == 0
-        for each in sums:  # The first process keeps what is left of all of them.
+        for each in sums:  # The first process keeps the reduced sums of the other cameras.
             each[known if first else slice(None)] = 0
 
     def corrected(self, poses: Tensor, frame: Frame) -> Tensor:
@@ -264,7 +264,7 @@ def without_common(places: Tensor, motion: Tensor, metric: Tensor, known: Tensor
         places: Positions of the cameras. [C, 3]
         motion: Turn and shift of each. [C, 6]
         metric: Square of the displacement in pixels, as a quadratic form of a motion. [C, 6, 6]
-        known: Cameras that count. bool [C]
+        known: Cameras with enough rays. bool [C]
 
     Returns:
         The smallest motions that differ by a common one; unchanged if not ``known``. [C, 6]

@@ -13,14 +13,7 @@ from xplanes.errors import ConfigError, SceneError
 from xplanes.fields.base import RadianceField, Representation
 from xplanes.rendering.base import Renderer, Rendering
 from xplanes.scenes.batches import Batch
-from xplanes.scenes.frame import (
-    NO_HINTS,
-    CameraGroups,
-    CubeHints,
-    Frame,
-    cube_frame,
-    scene_frame,
-)
+from xplanes.scenes.frame import NO_HINTS, CameraGroups, CubeHints, Frame, cube_frame, scene_frame
 from xplanes.scenes.views import Views
 from xplanes.settings import Settings
 from xplanes.streams import TrainingState
@@ -31,7 +24,7 @@ VIEWS_PER_ROW = 4
 """Views that a timestep needs to have its own row of the time planes."""
 
 MANY_POSITIONS = 50
-"""Camera positions from which a field has more detail than what few cameras show."""
+"""Number of camera positions from which fields have more detail."""
 
 Group = dict[str, Any]
 """A parameter group of the optimiser: ``params``, ``lr`` and ``name``."""
@@ -123,7 +116,7 @@ class Sampler(ABC):
     """Renders training batches, adds its own loss terms, and updates itself between steps."""
 
     fill_seconds: float = 0.0
-    """Extra seconds of building it for an initialised field; they count as preparation."""
+    """Extra seconds to build it for an initialised field; they count as preparation."""
 
     @property
     @abstractmethod
@@ -352,7 +345,7 @@ def origin_cube(half_side: float, views: Views, hints: CubeHints = NO_HINTS) -> 
     for name in ("half_side", "centre"):
         if (given := getattr(hints, name)) is not None:
             raise ConfigError(
-                f"data.{name}={given} with model.half_side={half_side}: two cubes; set "
+                f"data.{name}={given} with model.half_side={half_side}: both set the cube; set "
                 f"model.half_side=null to use data.{name}, or leave data.{name} out"
             )
     try:

@@ -206,8 +206,8 @@ def scene_frame(views: Views, hints: CubeHints = NO_HINTS) -> Frame:
 
     The cameras' common field of view gives a first cube around the point at which they look. The
     distance of the farthest foreground ray from the centre is a lower bound of the scene's radius,
-    and a close one for views from many sides. With a margin, it shrinks the cube; it does so less
-    for views from one side, which constrain the depth less. For opaque images, which have no
+    and a close one for views from many sides. This bound, with a margin, shrinks the cube: less for
+    views from one side, which constrain the depth less. For opaque images, which have no
     silhouettes, the cube encloses the points in the middle of most images, if enough are known.
 
     Args:
@@ -233,11 +233,10 @@ def scene_frame(views: Views, hints: CubeHints = NO_HINTS) -> Frame:
     half = float((depth.clamp_min(0) * extent.float()).max())
     if not math.isfinite(half) or half <= 0:
         raise SceneError(
-            "the cameras look away from one another, so the scene's bounds cannot be found. Axes "
-            "are OpenGL's: where those of the file are OpenCV's (y down, z forward), negate the "
-            "second and third column of every pose; where those of the file are world-to-camera, "
-            "invert them. If the poses are right, set data.half_side and data.centre, in world "
-            "units"
+            "the cameras look away from one another, so the scene's bounds cannot be found. Poses "
+            "must be camera-to-world with OpenGL axes: for OpenCV axes (y down, z forward), negate "
+            "the second and third column of every pose; invert world-to-camera poses. If the poses "
+            "are right, set data.half_side and data.centre, in world units"
         )
     if seen is not None:
         reach = (seen - centre).abs().max()
@@ -300,7 +299,7 @@ def _middle_box(views: Views, points: Tensor, centre: Tensor) -> Tensor | None:
 
 
 def _spread(views: Views) -> float:
-    """Foreshortening factor of the direction that the views show worst, in its best view.
+    """How well the views show the worst-shown direction: its foreshortening in the best view.
 
     It is nearly 1 for views from all sides, small for views from one side, which foreshorten depth,
     and 0 for views along a single axis.

@@ -85,7 +85,7 @@ class ErrorMap:
     """Recent mean colour error of each tile, for `preferred`.
 
     Args:
-        start: Batches before the errors are used, from the next update on.
+        start: Batches after which errors are used, from the next update on.
 
     Attributes:
         errors: Root mean squared error of each tile, or of all tiles where it is unknown; None
@@ -96,8 +96,8 @@ class ErrorMap:
         self.start, self.batches = start, 0
         self.errors: Tensor | None = None
         self._sums = torch.zeros(0)
-        """Sums of squared errors and their number: of all processes until the last update, then
-        of this process since it; empty before the first batch. [2, 2, MOST_TILES]"""
+        """Sums of squared errors and their number: of all processes up to the last update, and of
+        this process since then; empty before the first batch. [2, 2, MOST_TILES]"""
 
     def observe(
         self, batch: Mapping[str, Any], colour: Tensor, shown: Tensor | None = None
@@ -130,7 +130,7 @@ class ErrorMap:
             self.errors = self._errors()
 
     def drop_own(self) -> None:
-        """Forget what only this process has observed since the last update."""
+        """Discard the errors that this process has observed since the last update."""
         self._sums[1:].zero_()
 
     def _errors(self) -> Tensor | None:

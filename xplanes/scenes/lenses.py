@@ -54,8 +54,8 @@ class Lenses:
         model: Kind of each lens, a `LensModel`. int64 [V]
         coefficients: Distortion, in the order of `COEFFICIENTS`. float64 [V, 12]
         skew: Shift to the right in pixels per focal length downwards. float64 [V]
-        limit: Radius before distortion up to which each lens maps different directions to different
-            points; computed when None. float64 [V]
+        limit: Undistorted radius up to which each lens is invertible; computed when None.
+            float64 [V]
     """
 
     model: Tensor

@@ -18,8 +18,7 @@ OPAQUE, OPAQUE_SHARE = 64, 1e-3
 
 NOISE, SMALLER = 0.01, 5
 """A region is noise if its extent is below this share of the image's longer side, and the largest
-region is at least this many times as large. Long wires, and a small object that is alone, are thus
-kept."""
+region is at least this many times as large. Long wires and a single small object are thus kept."""
 
 
 def silhouette_of(alpha: Tensor) -> Tensor:

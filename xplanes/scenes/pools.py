@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from xplanes.scenes.silhouettes import count_in_squares
+from xplanes.scenes.silhouettes import count_in_squares, enlarged
 from xplanes.scenes.store import RUN, StoredImages
 from xplanes.scenes.views import Views
 
@@ -92,7 +92,7 @@ class PixelPools:
         return moved
 
     def pick(self, kind: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
-        """Draw pixels: whether each is far, its index. [R], [R] -> bool, int64 [R]
+        """Draw pixels; returns whether each is far, and its index. [R], [R] -> bool, int64 [R]
 
         ``kind`` and ``where`` are uniform numbers that choose the kind and the position in it.
         """
@@ -121,7 +121,7 @@ class RunPools:
     Args:
         views: Views whose images are ``images``.
         images: Images in files of pixels.
-        margins: Margin in pixels around each image's silhouette that is near, too. [V]
+        margins: Margin in pixels around each image's silhouette that counts as near. [V]
 
     Attributes:
         sizes: Numbers of far, textureless and near pixels; none are textureless.
@@ -164,7 +164,7 @@ class RunPools:
         self.far_share = far
 
     def pick(self, kind: Tensor, where: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As `PixelPools.pick`, for runs: whether each is far, its view, its index there. [K]"""
+        """Draw runs; returns whether each is far, its view, and its index in that view. [K]"""
         far, total, (size, _, rest) = kind < self.far_share, int(self.first[-1]), self.sizes
         place = torch.where(far, where * size, size + where * rest).long()
         place = place.clamp_(max=size + rest - 1)
@@ -193,12 +193,10 @@ def _widened(mask: Tensor, margin: int) -> Tensor:
     """The squares within ``margin`` pixels of those that contain mask pixels. bool [h, w]"""
     if mask.all():
         return mask
-    height, width = mask.shape
     reach = -(-margin // CELLS)
     held = (count_in_squares(mask, CELLS) > 0).float()[None]
     near = F.max_pool2d(held, 2 * reach + 1, stride=1, padding=reach)[0] > 0
-    near = near.repeat_interleave(CELLS, 0).repeat_interleave(CELLS, 1)
-    return near[:height, :width]
+    return enlarged(near, CELLS, mask.shape)
 
 
 def _in_runs(mask: Tensor) -> Tensor:

@@ -20,10 +20,10 @@ LEAST_FRAMES = 3
 """Least number of a camera's images for which their median shows the static content."""
 
 LEAST_CAMERAS = 2
-"""Least number of cameras that tell where in space something moves."""
+"""Least number of cameras that can locate motion in space."""
 
 HALF = 2
-"""Side in pixels of the squares that are compared to find where in space something moves."""
+"""Side in pixels of the squares that are compared to locate motion in space."""
 
 MARGIN = 1
 """Squares around a point that count as near it, since poses are not exact."""
@@ -72,9 +72,14 @@ def textureless(views: Views, margins: Sequence[int]) -> Tensor:
         most = F.max_pool2d(blocks.amax(dim=(1, 3)).permute(2, 0, 1).float(), 3, 1, 1)
         least = -F.max_pool2d(-blocks.amin(dim=(1, 3)).permute(2, 0, 1).float(), 3, 1, 1)
         even = ((most - least).amax(dim=0) <= SAME_COLOUR) & (least[3] == 255)
-        even = even.repeat_interleave(reach, 0).repeat_interleave(reach, 1)
-        found[index, :height, :width] = even
+        found[index, :height, :width] = enlarged(even, reach, (height, width))
     return found
+
+
+def enlarged(mask: Tensor, factor: int, size: Sequence[int]) -> Tensor:
+    """A mask enlarged by pixel replication and cropped to a size. bool [h, w] -> bool [H, W]"""
+    mask = mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
+    return mask[: size[0], : size[1]]
 
 
 def count_in_squares(mask: Tensor, side: int) -> Tensor:
@@ -211,21 +216,21 @@ def changing(views: Views, margins: Sequence[int]) -> Tensor | None:
 def moving(
     views: Views, points: Tensor, *, radius: float, bins: Tensor, count: int
 ) -> Tensor | None:
-    """Points around which every fixed camera that sees them, two at least, shows a change.
+    """Points around which all fixed cameras that see them, at least two, show a change.
 
-    What a static thing hides from one camera does not count. Cameras that move or have few images
-    are left out. Images are compared at half their size.
+    Points that a static object hides from one camera are not found. Cameras that move or have few
+    images are left out. Images are compared at half their size.
 
     Args:
         views: Opaque images in memory.
         points: World points. [N, 3]
         radius: As for `may_hold`.
         bins: Time bin of each view. int64 [V]
-        count: Number of bins. A bin shows the changes of all images in it, or of those in the bins
-            before and after that have any.
+        count: Number of bins. A bin shows the changes of all images in it; if it has none, of those
+            in the nearest bins before and after that have any.
 
     Returns:
-        For each bin, which points may be part of what moves, bool [count, N]; None if there are
+        For each bin, which points may belong to moving content, bool [count, N]; None if there are
         fewer than two fixed cameras.
     """
     cameras = [frames for frames in _cameras(views) if len(frames) >= LEAST_FRAMES]
@@ -260,7 +265,7 @@ def _in_halved(box: Sequence[Tensor], size: Sequence[int]) -> list[Tensor]:
 
 
 def _images_of_bin(bins: Tensor, place: int) -> Tensor:
-    """A camera's images in a time bin, or else in those next to it that have any. bool [F]"""
+    """A camera's images in a time bin, or in the nearest bins if it has none. bool [F]"""
     if (inside := bins == place).any():
         return inside
     before, after = bins[bins < place], bins[bins > place]
@@ -269,9 +274,9 @@ def _images_of_bin(bins: Tensor, place: int) -> Tensor:
 
 
 def _halved_changes(views: Views, frames: list[int]) -> tuple[Tensor | None, Tensor]:
-    """Squares of four pixels that a camera's images show, and that differ from their median.
+    """Squares of four pixels that are shown, and those that differ from their median over time.
 
-    Averages are compared: they are less noisy, and tell of lines of one pixel.
+    Averages are compared: they are less noisy and still show lines of one pixel.
 
     Returns:
         bool [F, h / 2, w / 2] each, rounded up; the first is None if all pixels are shown.

@@ -122,7 +122,7 @@ class PixelFile:
         if len(content) < length:
             raise StorageError(
                 f"{self.source} ends too early: it was truncated while in use. Delete it and start "
-                "again; then the images are decoded again"
+                "again to decode the images once more"
             )
         return np.frombuffer(content, np.uint8)
 
@@ -281,7 +281,7 @@ def images(
     try:
         require_writable(folder)
     except StorageError as problem:
-        raise StorageError(f"{problem}: data.cache names the one for decoded images") from problem
+        raise StorageError(f"{problem}; data.cache sets the folder of decoded images") from problem
     with in_turn(path.with_suffix(".lock")) as alone:
         if (ready := stored()) is not None:
             return ready
@@ -299,9 +299,9 @@ def images(
             )
         print(
             f"{len(sizes)} images of up to {width}x{height} px take {length / 2**30:.1f} GB "
-            f"decoded, too much for memory: decoding them once to {path} (it can be deleted when "
-            "no run needs it"
-            f"{f', and is after {UNUSED_DAYS} days without use' if is_default else ''})",
+            f"decoded, too much for memory: decoding them once to {path} (delete it when no run "
+            "needs it"
+            f"{f'; it is deleted after {UNUSED_DAYS} days without use' if is_default else ''})",
             flush=True,
         )
         with replacing(path) as temporary:

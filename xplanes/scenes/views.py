@@ -16,7 +16,7 @@ from xplanes.scenes.matte import silhouette_of
 from xplanes.scenes.store import PixelFile, StoredImages
 
 PALE_STEPS, PALE_EDGE = 16, 0.9
-"""Largest difference, out of 255, from the background's colour; its least share of the edge."""
+"""Largest difference, out of 255, from the background's colour; least share of such edge pixels."""
 
 RIM = 0.02
 """Width of an image's edge, as a share of its smaller side."""
@@ -146,7 +146,7 @@ class Intrinsics:
         return 2 * math.atan(float((0.5 * self.size[:, 0] / self.pinhole[:, 1]).median()))
 
     def focal_at(self, size: int) -> float:
-        """Focal length for ``size`` pixels of width and the median image's field of view."""
+        """Focal length of the median image if its longer side is resized to ``size`` pixels."""
         longer = self.size.amax(dim=1)
         return float((self.pinhole.mean(dim=1) * size / longer).median())
 
@@ -191,9 +191,8 @@ class Views:
         size = self.intrinsics.size
         if len(size) != count or (count and size.amax(dim=0).tolist() != [height, width]):
             raise ValueError(
-                f"views.images is {list(self.images.shape)}, which does not fit "
-                f"{len(size)} images of at most {size.amax(dim=0).tolist() if len(size) else 0} "
-                "pixels, as views.intrinsics says"
+                f"views.images is {list(self.images.shape)}, which does not fit views.intrinsics: "
+                f"{len(size)} images of at most {size.amax(dim=0).tolist() if len(size) else 0} px"
             )
         for name in ("foreground", "ignored"):
             pixels: Tensor | None = getattr(self, name)
@@ -433,7 +432,7 @@ class Views:
 
 
 def joined(first: Views, second: Views) -> Views:
-    """The views of both."""
+    """The views of both, without ``foreground``."""
     height, width = max(first.height, second.height), max(first.width, second.width)
 
     def together(parts: Sequence[Tensor]) -> Tensor:

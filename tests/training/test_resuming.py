@@ -58,7 +58,7 @@ def test_a_run_is_not_resumed_with_other_settings(scenes, folder):
     refused = {
         "model=nine_planes": r"model\.name=nine_planes: .* trained with model\.name=six_planes",
         "model.resolution=16": r"does not fit .*size mismatch for .* the run began with",
-        "trainer.max_steps=3": r"max_steps=3: .*has done 40 steps already",
+        "trainer.max_steps=3": r"max_steps=3: .*has already done 40 steps",
     }
     for override, words in refused.items():
         with pytest.raises(ConfigError, match=words):
@@ -76,7 +76,7 @@ def test_a_run_is_not_resumed_with_other_images(train, folder):
     record["files"]["train"].reverse()
     (folder / "run.json").write_text(json.dumps(record))
     for _ in range(2):  # The first refusal forgets nothing.
-        with pytest.raises(ConfigError, match=r"trained on 10 views, .* restore the scene's files"):
+        with pytest.raises(ConfigError, match=r"was trained on 10 views; .* restore the scene's files"):
             train(resume=True)
 
 

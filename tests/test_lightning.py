@@ -348,7 +348,7 @@ def test_plugins_of_the_docs_are_composed_and_loaded_again(config, tmp_path, mon
 
 def test_a_list_of_settings_is_refused():
     for kind in (RadianceModule, SceneDataModule):
-        with pytest.raises(ConfigError, match=r"^compose\(\['seed=1'\]\): takes settings one by"):
+        with pytest.raises(ConfigError, match=r"^compose\(\['seed=1'\]\): pass each setting"):
             kind.compose(["seed=1"])  # type: ignore[arg-type]
 
 

@@ -70,7 +70,7 @@ def test_opacities_of_foreground_and_background():
 
 def test_a_verdict_needs_rays_that_tell():
     nothing, sound, unknown = (0.01, 0.01), (0.9, 0.02), (math.nan, math.nan)
-    assert "shows nothing" in verdict([nothing] * 9 + [unknown], fog=False)
+    assert "field is empty" in verdict([nothing] * 9 + [unknown], fog=False)
     assert verdict([sound] * 9 + [nothing], fog=True) == ""
     assert verdict([unknown] * 9, fog=True) == ""
     assert "fog" in verdict([(0.9, 0.8)], fog=True)

@@ -192,7 +192,12 @@ STOP = {"_target_": f"{CALLBACKS}.EarlyStopping", "monitor": "val/pnsr"}
     [
         ("trainer", "logger", False, r"trainer\.logger=False: set logger=none"),
         ("trainer", "default_root_dir", "x", r"trainer\.default_root_dir=x: set hydra\.run\.dir"),
-        ("callbacks", "bar", BAR, r"callbacks\.bar\.theme\._target_=.*plain values.*class of your own"),
+        (
+            "callbacks",
+            "bar",
+            BAR,
+            r"callbacks\.bar\.theme\._target_=.*plain values.*class of your own",
+        ),
         ("callbacks", "stop", STOP, r"callbacks: EarlyStopping.*val/pnsr"),
     ],
 )

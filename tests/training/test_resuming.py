@@ -76,7 +76,9 @@ def test_a_run_is_not_resumed_with_other_images(train, folder):
     record["files"]["train"].reverse()
     (folder / "run.json").write_text(json.dumps(record))
     for _ in range(2):  # The first refusal forgets nothing.
-        with pytest.raises(ConfigError, match=r"was trained on 10 views; .* restore the scene's files"):
+        with pytest.raises(
+            ConfigError, match=r"was trained on 10 views; .* restore the scene's files"
+        ):
             train(resume=True)
 
 

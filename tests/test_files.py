@@ -42,6 +42,19 @@ def begin(path: Path, problem: Exception) -> None:
         raise problem
 
 
+def test_a_new_file_has_the_permissions_that_the_umask_leaves(tmp_path):
+    before = os.umask(0o077)
+    try:
+        write_text(tmp_path / "a.json", "whole")
+        os.umask(0o002)
+        write_text(tmp_path / "b.json", "whole")
+    finally:
+        os.umask(before)
+    if os.name == "posix":
+        modes = [oct((tmp_path / name).stat().st_mode & 0o777) for name in ("a.json", "b.json")]
+        assert modes == ["0o600", "0o664"]
+
+
 def listed(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir()]
 

@@ -289,6 +289,12 @@ def test_the_estimate_counts_every_image_as_the_field_is_when_it_is_drawn(scenes
     total, advice = said.split("\n")
     assert total == f"{7 + 85 + images} s in all: {parts}"
     assert "media=false" in advice
+    # Without a limit on steps and seconds, the field before the first step is still known.
+    endless = replace(experiment, trainer={**experiment.trainer, "max_steps": -1})
+    images = validated * (5 + 1 + 1) + tested + video
+    found = estimated(endless, data, module, expected, 7.0)
+    assert found == f"7 s so far, no end of training, {images} s of scores and images"
+    images = validated * (5 + 3 + 2) + 2 * (tested + video)
     # Random values are not scored before the first step if there are surroundings.
     begun = SimpleNamespace(frame=module.frame, site=replace(module.site, surrounded=True))
     later = estimated(experiment, data, begun, expected, 7.0)  # pyright: ignore

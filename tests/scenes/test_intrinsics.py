@@ -140,6 +140,10 @@ def test_views_of_different_cameras_are_joined():
         assert both.times[index] == part.times[own]
         assert_same_rays(both, index, part, own, atol=0)
     assert not both.images[~both.valid()].any()
+    assert both.foreground is None
+    shown = torch.full(square.images.shape[:3], 255, dtype=torch.uint8)
+    both = joined(views, replace(square, foreground=shown))
+    assert torch.equal(both.foreground != 0, both.valid() & (torch.arange(7) >= 4)[:, None, None])
 
 
 def test_one_camera_is_one_within_rounding():

@@ -138,7 +138,9 @@ def estimated(
     pixels = views.height * views.width * count
     whole = done + train / expected.step  # Evaluations before a resume are not repeated.
     shares = {*at, 1.0} - (set() if scored_before_training(module.site) else {0.0})
-    steps_at = [share * whole for share in shares if not done or share * whole > done]
+    steps_at = [
+        share * whole if share else 0.0 for share in shares if not done or share * whole > done
+    ]
     images = sum(pixels * expected.ray(step) for step in steps_at)
     if final is not views or count < len(views):
         images += final.height * final.width * len(final) * expected.ray(whole)

@@ -157,6 +157,8 @@ class Masked:
         self._field, self._keep = field, keep
 
     def __getattr__(self, name: str) -> Any:
+        if name == "_field":  # A copy or a pickle asks before it has one.
+            raise AttributeError(name)
         return getattr(self._field, name)
 
     def __call__(self, points: Tensor, times: Tensor, *directions: Tensor) -> tuple[Tensor, Tensor]:

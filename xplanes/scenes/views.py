@@ -432,7 +432,7 @@ class Views:
 
 
 def joined(first: Views, second: Views) -> Views:
-    """The views of both, without ``foreground``."""
+    """The views of both; of the two masks, views without one have an empty one."""
     height, width = max(first.height, second.height), max(first.width, second.width)
 
     def together(parts: Sequence[Tensor]) -> Tensor:
@@ -446,18 +446,22 @@ def joined(first: Views, second: Views) -> Views:
         images = together([first.images, second.images])
     else:
         images = _stored(first).joined(_stored(second))
-    ignored = None
-    if first.ignored is not None or second.ignored is not None:
-        none = (torch.zeros(each.images.shape[:3], dtype=torch.bool) for each in (first, second))
-        given = (first.ignored, second.ignored)
-        ignored = together([e if e is not None else n for e, n in zip(given, none, strict=True)])
+
+    def marked(name: str, kind: torch.dtype) -> Tensor | None:
+        given = [getattr(each, name) for each in (first, second)]
+        if given == [None, None]:
+            return None
+        empty = (torch.zeros(each.images.shape[:3], dtype=kind) for each in (first, second))
+        return together([e if m is None else m for m, e in zip(given, empty, strict=True)])
+
     return Views(
         images,
         torch.cat([first.camera_to_world, second.camera_to_world]),
         torch.cat([first.times, second.times]),
         first.intrinsics.joined(second.intrinsics),
         first.files + second.files,
-        ignored=ignored,
+        foreground=marked("foreground", torch.uint8),
+        ignored=marked("ignored", torch.bool),
     )
 
 

@@ -127,7 +127,7 @@ def test_a_resumed_run_goes_on_with_its_csv(scenes, tmp_path):
     assert [{k: row[k] for k in before[0]} for row in kept][:4] == before[:4]
 
 
-@pytest.mark.parametrize("rest", ["0.5,9", "0.5,,", "0.5,\0\0", "0.5,9,0.5,9"])
+@pytest.mark.parametrize("rest", ["0.5,9", "0.5,5,0", "0.5,,", "0.5,\0\0", "0.5,9,0.5,9"])
 def test_a_row_that_was_cut_off_does_not_end_the_csv(tmp_path, rest):
     def log(step: int) -> None:
         log = OwnCSVLogger(tmp_path, name="", version="csv")

@@ -29,12 +29,15 @@ class CSVLogger(loggers.CSVLogger):
 class _Writer(ExperimentWriter):
     def _check_log_dir_exists(self) -> None:
         """Read an earlier file, where Lightning's class would delete it."""
-        rows = read_rows(Path(self.metrics_file_path))  # The last may be cut off.
+        path = Path(self.metrics_file_path)
+        rows = read_rows(path)
+        if rows and not path.read_bytes().endswith(b"\n"):  # Its process was killed.
+            rows.pop()
         self._earlier: list[Any] = [
             row for row in rows if None not in (*row, *row.values()) and row["step"].isdigit()
         ]
         if not self._earlier:
-            Path(self.metrics_file_path).unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
 
     def log_metrics(self, metrics_dict: dict[str, float], step: int | None = None) -> None:
         if step is not None and self._earlier:

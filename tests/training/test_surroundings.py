@@ -152,6 +152,12 @@ def test_light_that_passes_the_cube_costs_until_the_field_has_taken_shape():
         assert (found is None) == (weight is None), step
         if weight is not None:
             assert float(found) == pytest.approx(weight * passed)
+    # A short run spends at most 30% of its budget on it.
+    for progress, weight in ((0.1, 0.5 * 2 / 3), (0.3, 0)):
+        state = replace(module.state, step=50, progress=progress)
+        found = float(module.model.losses(rendering, batch, state).get("passing", 0))
+        assert found == pytest.approx(weight * passed)
+        assert (module.model.group_rate_factor("time", 50, progress) > 0) == (weight == 0)
 
 
 def test_in_a_rig_light_stopped_at_the_border_passes_for_longer():

@@ -47,6 +47,9 @@ RIG_VIEWS = 2
 MOST_SMOOTH = 10.0
 """Largest factor on total variation for few camera positions."""
 
+MOST_STATIC = 0.3
+"""Largest share of the budget in which light that passes the cube costs and time planes wait."""
+
 FINE_WARMUP = 100
 """Warm-up steps of the fine planes' learning rate."""
 
@@ -121,7 +124,8 @@ class XPlanesLoss(Settings):
     # trained until then: they would build fog that differs from view to view, blocks the light and
     # persists.
     passing: Weight
-    passing_steps: Steps  # Steps over which `model.loss.passing` falls to 0.
+    # Steps over which `model.loss.passing` falls to 0; at most 30% of the training budget.
+    passing_steps: Steps
     # The same for rigs, where at least two views show each timestep on average. For rigs, light
     # absorbed near a face of the cube counts as passing, as in `model.sampler.border`.
     rig_passing_steps: Steps
@@ -368,7 +372,7 @@ class XPlanesModel(Model):
 
     def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
         terms = super().losses(rendering, rays, state)
-        if weight := self._passing_weight(state.step):
+        if weight := self._passing_weight(state.step, state.progress):
             terms["passing"] = weight * ray_mean(1 - rendering.opacity, rays)
             border: Tensor | None = getattr(rendering, "border", None)
             if self._is_rig and border is not None:
@@ -388,7 +392,7 @@ class XPlanesModel(Model):
         return warm_cosine(step, progress, warmup=self.warmup, final=self.settings.final_lr)
 
     def group_rate_factor(self, group: str, step: int, progress: float) -> float:
-        if group == "time" and self._passing_weight(step):
+        if group == "time" and self._passing_weight(step, progress):
             return 0.0
         if group != "fine":
             return self.rate_factor(step, progress)
@@ -476,12 +480,12 @@ class XPlanesModel(Model):
             for plane, initial in self._initial
         )
 
-    def _passing_weight(self, step: int) -> float:
+    def _passing_weight(self, step: int, progress: float) -> float:
         """Weight of the cube's mean transmittance; 0 without a learnt background."""
         steps = self.weights.passing_steps
         if self._field.background is None or not steps:
             return 0.0
-        return self.weights.passing * max(0.0, 1 - step / steps)
+        return self.weights.passing * max(0.0, 1 - max(step / steps, progress / MOST_STATIC))
 
     def _fading(self, step: int) -> float:
         """Factor on the regularisers that keep the field near its initialisation."""

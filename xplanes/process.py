@@ -15,7 +15,7 @@ from pathlib import Path
 STARTED = time.perf_counter()
 """Time at which this process started, on the clock of `time.perf_counter`."""
 
-WAIT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "10000"}
+WAIT = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "1000"}
 """Idle threads spin briefly, then sleep: long spinning wastes the cores of a shared machine."""
 
 

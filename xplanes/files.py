@@ -147,7 +147,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}{MARK}{uuid.uuid4().hex}{path.suffix}")
+        temporary = path.with_name(f".{path.name}{MARK}{uuid.uuid4().hex[:8]}{path.suffix}")
         temporary.touch(exist_ok=False)  # With the permissions of any new file.
         try:
             yield temporary

@@ -1,5 +1,7 @@
 """The field: names and shapes of planes, gradients to all parameters, initial values."""
 
+import copy
+
 import pytest
 import torch
 
@@ -135,3 +137,11 @@ def test_random_planes_repeat_with_their_seed_and_have_their_scale():
         assert float(first["xy"].std()) == pytest.approx(0.3, rel=0.05), plane_set
         for name in TIME_PLANES[plane_set]:
             assert float(first[name].std()) == pytest.approx(0.5, rel=0.15), (plane_set, name)
+
+
+def test_a_masked_field_can_be_copied():
+    masked = field_of("six").masked(lambda points: points[:, 0] > 0)
+    points, times = torch.tensor([[0.5, 0, 0], [-0.5, 0, 0]]), torch.zeros(2)
+    found, again = (each(points, times)[1] for each in (masked, copy.copy(masked)))
+    assert found[0] > found[1] == 0
+    assert torch.equal(found, again)

@@ -449,7 +449,7 @@ def joined(first: Views, second: Views) -> Views:
 
     def marked(name: str, kind: torch.dtype) -> Tensor | None:
         given = [getattr(each, name) for each in (first, second)]
-        if given == [None, None]:
+        if all(mask is None for mask in given):
             return None
         empty = (torch.zeros(each.images.shape[:3], dtype=kind) for each in (first, second))
         return together([e if m is None else m for m, e in zip(given, empty, strict=True)])

@@ -11,7 +11,7 @@ from xplanes.rendering.box import shade
 from xplanes.rendering.compositing import OPAQUE
 from xplanes.rendering.marching import Samples
 
-AT_ONCE = 2**14
+AT_ONCE = 2**15
 """Samples per evaluation of the field.
 
 Their features fit in the cache, and their memory is reused: above 32 MB the C library returns

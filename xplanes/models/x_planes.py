@@ -9,7 +9,7 @@ products of the space-time planes near the sparse part of the LRM's triplanes (E
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -35,10 +35,11 @@ from xplanes.models.base import (
     ray_mean,
     warm_cosine,
 )
+from xplanes.models.coarse import smooth
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Group, Site, time_rows
 from xplanes.scenes.batches import Batch
-from xplanes.settings import Count, Positive, Settings, Share, Steps, Weight
+from xplanes.settings import FROM_0, Count, Positive, Settings, Share, Steps, Weight
 from xplanes.streams import Stream, TrainingState, initial_values, step_generator
 
 RIG_VIEWS = 2
@@ -129,6 +130,12 @@ class XPlanesLoss(Settings):
     # The same for rigs, where at least two views show each timestep on average. For rigs, light
     # absorbed near a face of the cube counts as passing, as in `model.sampler.border`.
     rig_passing_steps: Steps
+    # Rigs with a learnt background and a randomly initialised field: texels on either side over
+    # which gradients of space planes and background are smoothed at first, so that coarse structure
+    # finds its depth before details do; it falls to 0 over twice `model.loss.rig_passing_steps`, or
+    # 60% of the training budget. Fewer texels if the images have little coarse structure, none if
+    # the cameras are far away. 0: never.
+    rig_coarse_texels: Annotated[int, FROM_0]
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
     sparse_weight: Weight  # Weight of L_r (X-Planes, Eq. 17).
     sparse_reduction: Literal["mean", "sum"]  # Reduction of L_r over entries; the paper: sum.
@@ -311,6 +318,10 @@ class XPlanesModel(Model):
             self.total_variation = self.weights.total_variation_with_background
         elif self.fine_settings is not None:
             self.total_variation = self.fine_settings.coarse_variation
+        self.coarse_texels = 0.0
+        if self._is_rig and field.background is not None and not site.initialised:
+            texels = site.coherence * field.space.shape[2]
+            self.coarse_texels = min(texels, self.weights.rig_coarse_texels)
         smoother = self._few_views(site)
         self.total_variation *= smoother
         self.background_factor = smoother**0.5
@@ -404,6 +415,7 @@ class XPlanesModel(Model):
 
     def regularise(self, state: TrainingState) -> None:
         every, field, weights = self.weights.every, self._field, self.weights
+        self._smooth_gradients(state)
         if state.step % every or field.space.grad is None:
             return
         if field.background is not None and self.settings.background is not None:
@@ -436,6 +448,19 @@ class XPlanesModel(Model):
             generator = step_generator(state.seed, state.step, Stream.FRAMES)
             weight = fading * weights.sparse_weight * every
             self.product.add_gradient(field.time.grad, field.time, weight, generator)  # Eq. 17
+
+    def _smooth_gradients(self, state: TrainingState) -> None:
+        """Smooth the gradients of space planes and background in the first part of training."""
+        steps = 2 * self.weights.rig_passing_steps
+        if not self.coarse_texels or not steps:
+            return
+        done = max(state.step / steps, state.progress / (2 * MOST_STATIC))
+        if not (radius := int(self.coarse_texels * max(0.0, 1 - done))):
+            return
+        assert self._field.background is not None
+        for planes in (self._field.space, self._field.background.planes):
+            if planes.grad is not None:
+                smooth(planes.grad, radius)
 
     @torch.no_grad()
     def regularisers(self, state: TrainingState) -> dict[str, float]:

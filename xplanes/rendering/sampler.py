@@ -45,6 +45,8 @@ class Site:
         positions: Number of positions of the training cameras; None if unknown.
         initialised: Whether the initial field already shows the scene.
         pixels: Image pixels that a side of the field's cube covers.
+        coherence: Largest radius of a blur that leaves the training images recognisable, as a share
+            of the cube's side; 0 if unknown.
         surrounded: Whether the training images show surroundings, which lie behind the field's
             cube.
         cameras: Training cameras whose poses are refined; None if they are taken as exact.
@@ -63,6 +65,7 @@ class Site:
     positions: int | None = None
     initialised: bool = False
     pixels: float = 0.0
+    coherence: float = 0.0
     surrounded: bool = False
     cameras: CameraGroups | None = None
     exposed: CameraGroups | None = None

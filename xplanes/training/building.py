@@ -13,6 +13,7 @@ from xplanes.components import build, plugins
 from xplanes.errors import ConfigError
 from xplanes.fields.base import Representation
 from xplanes.models.base import LossTerm, Model, ModelSettings
+from xplanes.models.coarse import coherence
 from xplanes.models.initialisation import Initialisation, Method, Place, initialisation_of
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.exposure import START as EXPOSURE_START
@@ -147,6 +148,7 @@ def build_parts(
         positions=views.positions,
         initialised=found.values is not None,
         pixels=pixels_across(views, found.frame),
+        coherence=coherence(views, found.frame) if scene.is_surrounded else 0.0,
         surrounded=scene.is_surrounded,
         cameras=cameras if scene.refine_cameras else None,
         exposed=cameras if rays.matches_exposure and scene.is_surrounded else None,
@@ -220,6 +222,7 @@ def site_content(parts: Parts) -> dict[str, Any]:
         "positions": site.positions,
         "initialised": site.initialised,
         "pixels": site.pixels,
+        "coherence": site.coherence,
         "surrounded": site.surrounded,
         "cameras": None if site.cameras is None else vars(site.cameras),
         "exposed": None if site.exposed is None else vars(site.exposed),
@@ -256,6 +259,7 @@ def parts_from(
         bounds=content["bounds"],
         positions=None if content["initialised"] else content.get("positions"),
         pixels=content["pixels"],
+        coherence=content.get("coherence", 0.0),
         surrounded=content["surrounded"],
         cameras=cameras,
         exposed=exposed,

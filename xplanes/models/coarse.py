@@ -21,7 +21,7 @@ UNITS = 64
 RADII = (1, 2, 4, 8, 16)
 """Blur radii, in `UNITS`."""
 
-RECOGNISABLE = 0.15
+RECOGNISABLE = 0.18
 """Share of the images' variance that a blur must leave."""
 
 TRIED = 12

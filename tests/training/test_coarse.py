@@ -57,8 +57,8 @@ def test_gradients_are_smoothed_at_first():
     module, model = rig()
     assert module.model.coarse_texels == 0  # One view of each timestep.
     stacks = model.field.space, model.field.background.planes
-    steps = 2 * model.weights.rig_passing_steps
-    for done, progress, radius in ((0, 0, 8), (0.5, 0, 4), (0, 0.3, 4), (0, 0.6, 0), (1, 0, 0)):
+    steps = model.weights.rig_passing_steps
+    for done, progress, radius in ((0, 0, 8), (0.5, 0, 4), (0, 0.15, 4), (0, 0.3, 0), (1, 0, 0)):
         before = [torch.randn_like(planes) for planes in stacks]
         for planes, gradient in zip(stacks, before, strict=True):
             planes.grad = gradient.clone()

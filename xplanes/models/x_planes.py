@@ -132,9 +132,8 @@ class XPlanesLoss(Settings):
     rig_passing_steps: Steps
     # Rigs with a learnt background and a randomly initialised field: texels on either side over
     # which gradients of space planes and background are smoothed at first, so that coarse structure
-    # finds its depth before details do; it falls to 0 over twice `model.loss.rig_passing_steps`, or
-    # 60% of the training budget. Fewer texels if the images have little coarse structure, none if
-    # the cameras are far away. 0: never.
+    # finds its depth before details do; it falls to 0 as `model.loss.passing` does. Fewer texels if
+    # the images have little coarse structure, none if the cameras are far away. 0: never.
     rig_coarse_texels: Annotated[int, FROM_0]
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
     sparse_weight: Weight  # Weight of L_r (X-Planes, Eq. 17).
@@ -450,12 +449,9 @@ class XPlanesModel(Model):
             self.product.add_gradient(field.time.grad, field.time, weight, generator)  # Eq. 17
 
     def _smooth_gradients(self, state: TrainingState) -> None:
-        """Smooth the gradients of space planes and background in the first part of training."""
-        steps = 2 * self.weights.rig_passing_steps
-        if not self.coarse_texels or not steps:
-            return
-        done = max(state.step / steps, state.progress / (2 * MOST_STATIC))
-        if not (radius := int(self.coarse_texels * max(0.0, 1 - done))):
+        """Smooth the gradients of space planes and background while time planes wait."""
+        share = self._static_share(state.step, state.progress)
+        if not (radius := int(self.coarse_texels * share)):
             return
         assert self._field.background is not None
         for planes in (self._field.space, self._field.background.planes):
@@ -507,10 +503,14 @@ class XPlanesModel(Model):
 
     def _passing_weight(self, step: int, progress: float) -> float:
         """Weight of the cube's mean transmittance; 0 without a learnt background."""
+        return self.weights.passing * self._static_share(step, progress)
+
+    def _static_share(self, step: int, progress: float) -> float:
+        """What is left of the steps in which static content is learnt first, from 1 to 0."""
         steps = self.weights.passing_steps
         if self._field.background is None or not steps:
             return 0.0
-        return self.weights.passing * max(0.0, 1 - max(step / steps, progress / MOST_STATIC))
+        return max(0.0, 1 - max(step / steps, progress / MOST_STATIC))
 
     def _fading(self, step: int) -> float:
         """Factor on the regularisers that keep the field near its initialisation."""

@@ -48,7 +48,7 @@ NOT_MEASURED = re.compile(
 """Settings that change nothing of what is measured: where things lie, what classes are called."""
 
 WITH_SURROUNDINGS = re.compile(
-    r"model\.background\..*|model\..*_with_background|model\.loss\.(passing|rig)_.*|model\.loss\.passing"
+    r"model\.background\..*|model\..*_with_background|model\.loss\.(passing|rig).*"
     r"|model\.sampler\.(border|distortion)"
 )
 """Settings that change nothing where the images show an object without surroundings."""

@@ -35,15 +35,12 @@ from xplanes.models.base import (
     ray_mean,
     warm_cosine,
 )
-from xplanes.models.coarse import smooth
+from xplanes.models.smoothing import smoothed
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Group, Site, time_rows
 from xplanes.scenes.batches import Batch
 from xplanes.settings import FROM_0, Count, Positive, Settings, Share, Steps, Weight
 from xplanes.streams import Stream, TrainingState, initial_values, step_generator
-
-RIG_VIEWS = 2
-"""Minimum mean number of views per timestep for which cameras count as a rig."""
 
 MOST_SMOOTH = 10.0
 """Largest factor on total variation for few camera positions."""
@@ -134,7 +131,7 @@ class XPlanesLoss(Settings):
     # which gradients of space planes and background are smoothed at first, so that coarse structure
     # finds its depth before details do; it falls to 0 as `model.loss.passing` does. Fewer texels if
     # the images have little coarse structure, none if the cameras are far away. 0: never.
-    rig_coarse_texels: Annotated[int, FROM_0]
+    rig_smoothing: Annotated[int, FROM_0]
     time_identity: Weight  # Weight of the time planes' mean distance from 1, as in K-Planes.
     sparse_weight: Weight  # Weight of L_r (X-Planes, Eq. 17).
     sparse_reduction: Literal["mean", "sum"]  # Reduction of L_r over entries; the paper: sum.
@@ -199,7 +196,7 @@ class XPlanesSettings(ModelSettings):
         """Texels of the space planes along each axis; without a site for planes from an LRM."""
         if self.resolution != "auto":
             return self.resolution
-        if site is None or not (site.surrounded and site.moves):
+        if site is None or site.initialised or not (site.surrounded and site.moves):
             return USUAL_TEXELS
         many = site.is_seen_from_many and site.pixels >= LEAST_PIXELS
         return MORE_TEXELS if many else USUAL_TEXELS
@@ -305,7 +302,7 @@ class XPlanesModel(Model):
         self._field, self.settings, self.weights = field, settings, settings.loss
         self.fine_settings = None if field.fine is None else settings.fine
         self.total_variation = self.weights.total_variation
-        self._is_rig = site.moves and len(site.times) >= RIG_VIEWS * len(site.times.unique())
+        self._is_rig = site.is_rig
         if field.background is not None:
             self.weights = settings.loss.with_learnt_background()
             if self._is_rig:
@@ -317,10 +314,7 @@ class XPlanesModel(Model):
             self.total_variation = self.weights.total_variation_with_background
         elif self.fine_settings is not None:
             self.total_variation = self.fine_settings.coarse_variation
-        self.coarse_texels = 0.0
-        if self._is_rig and field.background is not None and not site.initialised:
-            texels = site.coherence * field.space.shape[2]
-            self.coarse_texels = min(texels, self.weights.rig_coarse_texels)
+        self.smoothing = min(site.coherence * field.space.shape[2], self.weights.rig_smoothing)
         smoother = self._few_views(site)
         self.total_variation *= smoother
         self.background_factor = smoother**0.5
@@ -451,12 +445,12 @@ class XPlanesModel(Model):
     def _smooth_gradients(self, state: TrainingState) -> None:
         """Smooth the gradients of space planes and background while time planes wait."""
         share = self._static_share(state.step, state.progress)
-        if not (radius := int(self.coarse_texels * share)):
+        if not (radius := int(self.smoothing * share)):
             return
         assert self._field.background is not None
         for planes in (self._field.space, self._field.background.planes):
             if planes.grad is not None:
-                smooth(planes.grad, radius)
+                planes.grad.copy_(smoothed(planes.grad, radius))
 
     @torch.no_grad()
     def regularisers(self, state: TrainingState) -> dict[str, float]:

@@ -23,6 +23,9 @@ logger = logging.getLogger(__name__)
 VIEWS_PER_ROW = 4
 """Views that a timestep needs to have its own row of the time planes."""
 
+RIG_VIEWS = 2
+"""Minimum mean number of views per timestep for which cameras count as a rig."""
+
 MANY_POSITIONS = 50
 """Number of camera positions from which fields have more detail."""
 
@@ -46,7 +49,7 @@ class Site:
         initialised: Whether the initial field already shows the scene.
         pixels: Image pixels that a side of the field's cube covers.
         coherence: Largest radius of a blur that leaves the training images recognisable, as a share
-            of the cube's side; 0 if unknown.
+            of the cube's side; 0 if nothing is to be smoothed.
         surrounded: Whether the training images show surroundings, which lie behind the field's
             cube.
         cameras: Training cameras whose poses are refined; None if they are taken as exact.
@@ -90,6 +93,11 @@ class Site:
     def moves(self) -> bool:
         """Whether the training views show more than one timestep."""
         return len(self.times.unique()) > 1
+
+    @property
+    def is_rig(self) -> bool:
+        """Whether several cameras show each timestep."""
+        return self.moves and len(self.times) >= RIG_VIEWS * len(self.times.unique())
 
     @property
     def is_seen_from_many(self) -> bool:

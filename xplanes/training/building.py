@@ -13,8 +13,8 @@ from xplanes.components import build, plugins
 from xplanes.errors import ConfigError
 from xplanes.fields.base import Representation
 from xplanes.models.base import LossTerm, Model, ModelSettings
-from xplanes.models.coarse import coherence
 from xplanes.models.initialisation import Initialisation, Method, Place, initialisation_of
+from xplanes.models.smoothing import coherence
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.exposure import START as EXPOSURE_START
 from xplanes.rendering.exposure import ExposureSampler
@@ -148,7 +148,6 @@ def build_parts(
         positions=views.positions,
         initialised=found.values is not None,
         pixels=pixels_across(views, found.frame),
-        coherence=coherence(views, found.frame) if scene.is_surrounded else 0.0,
         surrounded=scene.is_surrounded,
         cameras=cameras if scene.refine_cameras else None,
         exposed=cameras if rays.matches_exposure and scene.is_surrounded else None,
@@ -156,6 +155,8 @@ def build_parts(
         samples_per_batch=resolved.most_samples,
         batch_scale=resolved.most_rays / rays.most_rays if rays.most_rays else 1.0,
     )
+    if site.is_rig and site.surrounded and not site.initialised:
+        site = replace(site, coherence=coherence(views, site.frame))
     parts = Parts.assemble(found.model, site, found)
     assert parts.initialisation is not None
     seconds = found.seconds | {"fill": parts.sampler.fill_seconds}
@@ -257,7 +258,8 @@ def parts_from(
         seed=method.seed,
         precision=precision_of(settings, torch.device("cpu")),
         bounds=content["bounds"],
-        positions=None if content["initialised"] else content.get("positions"),
+        positions=content.get("positions"),
+        initialised=content["initialised"],
         pixels=content["pixels"],
         coherence=content.get("coherence", 0.0),
         surrounded=content["surrounded"],

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 
 from tests.balls import ball_views
 from tests.training.test_surroundings import built
-from xplanes.models.coarse import FAR, coherence, smooth
+from xplanes.models.smoothing import FAR, coherence, smoothed
 from xplanes.scenes.frame import cube_frame, pixels_across
 from xplanes.training.building import parts_from, site_content
 
@@ -22,12 +22,10 @@ def boxes(planes, radius):
     return planes.permute(0, 2, 3, 1)
 
 
-@pytest.mark.parametrize("radius", [0, 1, 3])
+@pytest.mark.parametrize("radius", [1, 3])
 def test_smoothing_is_two_box_filters(radius):
-    gradient = torch.randn(3, 12, 9, 4, dtype=torch.float64)
-    expected = boxes(gradient, radius) if radius else gradient.clone()
-    smooth(gradient, radius)
-    torch.testing.assert_close(gradient, expected)
+    planes = torch.randn(3, 12, 9, 4, dtype=torch.float64)
+    torch.testing.assert_close(smoothed(planes, radius), boxes(planes, radius))
 
 
 @pytest.mark.parametrize(("squares", "expected"), [(2, 16 / 64), (8, 2 / 64), (64, 0.0)])
@@ -48,14 +46,14 @@ def test_images_of_small_patterns_are_blurred_less(squares, expected):
 
 
 def rig(texels=16):
-    module = built("world", f"model.loss.rig_coarse_texels={texels}", "model.resolution=64")
+    module = built("world", f"model.loss.rig_smoothing={texels}", "model.resolution=64")
     site = replace(module.site, times=module.site.times.repeat(2), coherence=8 / 64)
     return module, module.model.settings.build(site)
 
 
 def test_gradients_are_smoothed_at_first():
     module, model = rig()
-    assert module.model.coarse_texels == 0  # One view of each timestep.
+    assert module.model.smoothing == module.site.coherence == 0  # One view of each timestep.
     stacks = model.field.space, model.field.background.planes
     steps = model.weights.rig_passing_steps
     for done, progress, radius in ((0, 0, 8), (0.5, 0, 4), (0, 0.15, 4), (0, 0.3, 0), (1, 0, 0)):
@@ -66,15 +64,17 @@ def test_gradients_are_smoothed_at_first():
         for planes, gradient in zip(stacks, before, strict=True):
             expected = boxes(gradient, radius) if radius else gradient
             torch.testing.assert_close(planes.grad, expected, atol=1e-5, rtol=1e-4)
-    assert rig(3)[1].coarse_texels == 3
-    assert rig(0)[1].coarse_texels == 0
+    assert rig(3)[1].smoothing == 3
+    assert rig(0)[1].smoothing == 0
 
 
-def test_the_blur_that_images_allow_travels_with_the_field():
+def test_what_the_images_allow_travels_with_the_field():
     module, _ = rig()
-    parts = replace(module.parts, site=replace(module.site, coherence=4 / 64))
+    parts = replace(module.parts, site=replace(module.site, coherence=4 / 64, initialised=True))
     content = site_content(parts)
-    found = parts_from(content, module.method, (), None).site
-    assert found.coherence == 4 / 64
+    found = parts_from(content, module.method, (), None)
+    assert (found.site.coherence, found.site.positions) == (4 / 64, module.site.positions)
+    assert found.site.initialised
+    assert found.model.weights.passing == 0 < module.model.weights.passing
     del content["coherence"]  # Checkpoints of before.
     assert parts_from(content, module.method, (), None).site.coherence == 0

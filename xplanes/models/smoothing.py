@@ -1,4 +1,4 @@
-"""Coarse structure first: smooth gradients of planes, as far as the images stay recognisable.
+"""Coarse structure first: smoothed gradients of planes, as far as images stay recognisable.
 
 Before few cameras, a background can explain each image by content of its own, at a wrong depth. Of
 what is smooth, all images show the same large shapes, which fit together only at the right depth;
@@ -11,7 +11,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from xplanes.metrics import mean
 from xplanes.scenes.frame import Frame, pixels_across
 from xplanes.scenes.views import Views
 
@@ -32,18 +31,15 @@ FAR = 10.0
 surroundings."""
 
 
-def smooth(gradient: Tensor, radius: int) -> None:
-    """Smooth a gradient of planes along both axes in place, by two box filters. [P, H, W, C]
+def smoothed(planes: Tensor, radius: int) -> Tensor:
+    """Planes after two box filters along both axes. [P, H, W, C]
 
     Args:
-        gradient: The gradient.
+        planes: Planes, or their gradient.
         radius: Texels on either side of a box's centre.
     """
-    if radius < 1:
-        return
-    rows, columns = (_filter(size, radius).to(gradient) for size in gradient.shape[1:3])
-    down = torch.matmul(rows, gradient.flatten(2)).view_as(gradient)
-    torch.matmul(columns, down, out=gradient)
+    rows, columns = (_filter(size, radius).to(planes) for size in planes.shape[1:3])
+    return columns @ (rows @ planes.flatten(2)).view_as(planes)
 
 
 def coherence(views: Views, frame: Frame) -> float:
@@ -62,26 +58,21 @@ def coherence(views: Views, frame: Frame) -> float:
     unit = pixels_across(views, frame) / UNITS
     kept = []
     for index in range(0, len(views), max(1, len(views) // TRIED)):
-        image = views.composite(index, torch.zeros(3)).permute(2, 0, 1)[None].double()
-        size = [max(1, round(length / unit)) for length in image.shape[2:]]
-        small = F.interpolate(image, size, mode="area").permute(0, 2, 3, 1)
-        variance = _variance(image.permute(0, 2, 3, 1))
-        if not variance:
-            continue
-        shares = []
-        for radius in RADII:
-            blurred = small.clone()
-            smooth(blurred, radius)
-            shares.append(_variance(blurred) / variance)
-        kept.append(shares)
-    means = [mean(shares) for shares in zip(*kept, strict=True)]
-    found = [r for r, share in zip(RADII, means, strict=False) if share >= RECOGNISABLE]
-    return max(found, default=0) / UNITS
+        image = views.composite(index, torch.zeros(3))[None]
+        size = [max(1, round(length / unit)) for length in image.shape[1:3]]
+        small = F.interpolate(image.permute(0, 3, 1, 2), size, mode="area").permute(0, 2, 3, 1)
+        variances = torch.stack([_variance(smoothed(small, radius)) for radius in RADII])
+        if variance := float(_variance(image)):
+            kept.append(variances / variance)
+    if not kept:
+        return 0.0
+    recognisable = torch.stack(kept).mean(dim=0) >= RECOGNISABLE
+    return max((r for r, seen in zip(RADII, recognisable, strict=True) if seen), default=0) / UNITS
 
 
-def _variance(image: Tensor) -> float:
-    """Variance of an image over its pixels, summed over channels. [1, H, W, 3]"""
-    return float(image.var(dim=(1, 2), correction=0).sum())
+def _variance(image: Tensor) -> Tensor:
+    """Variance of an image over its pixels, summed over channels. [1, H, W, 3] -> []"""
+    return image.var(dim=(1, 2), correction=0).sum()
 
 
 @lru_cache(maxsize=64)

@@ -7,6 +7,7 @@ details then follow them. The idea is that of frequency annealing (FreeNeRF, 202
 
 from functools import lru_cache
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -18,9 +19,9 @@ UNITS = 64
 """Blur radii are tried in units of this fraction of the cube's side."""
 
 RADII = (1, 2, 4, 8, 16)
-"""Blur radii, in `UNITS`."""
+"""Blur radii that are tried, in `UNITS`; between them, variances are interpolated."""
 
-RECOGNISABLE = 0.18
+RECOGNISABLE = 0.27
 """Share of the images' variance that a blur must leave."""
 
 TRIED = 12
@@ -66,8 +67,9 @@ def coherence(views: Views, frame: Frame) -> float:
             kept.append(variances / variance)
     if not kept:
         return 0.0
-    recognisable = torch.stack(kept).mean(dim=0) >= RECOGNISABLE
-    return max((r for r, seen in zip(RADII, recognisable, strict=True) if seen), default=0) / UNITS
+    shares = torch.stack(kept).mean(dim=0)
+    octave = np.interp(-RECOGNISABLE, (-shares).numpy(), np.log2(RADII), left=-np.inf)
+    return float(2**octave) / UNITS
 
 
 def _variance(image: Tensor) -> Tensor:

@@ -130,11 +130,7 @@ COMMANDS = {
 
 
 def build_parser(further: Sequence[AddCommands] = ()) -> argparse.ArgumentParser:
-    """All commands and their options.
-
-    Args:
-        further: Add the commands of plug-ins to the subparsers.
-    """
+    """All commands and their options; ``further`` adds those of plug-ins."""
     parser = argparse.ArgumentParser(
         prog="xplanes",
         description="Dynamic radiance fields initialised from Large Reconstruction Models.",

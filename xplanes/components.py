@@ -155,12 +155,7 @@ def _nested(key: str, value: Any, hint: Any) -> Any:
 
 
 def class_of(target: Any, kind: type, key: str) -> type:
-    """The class of a dotted name, if it is allowed in that place.
-
-    Args:
-        target: The name, as module.Class.
-        kind: Required base class.
-        key: Dotted name of the setting, for messages.
+    """The class of a dotted name, if it is derived from ``kind`` and allowed; ``key`` names it.
 
     Raises:
         ConfigError: If there is no such class, or it is not allowed there.

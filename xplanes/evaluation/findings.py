@@ -66,12 +66,7 @@ def stray_pixels(alpha: Tensor) -> int:
 
 
 def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
-    """Problems of cameras and times, and views that two splits share.
-
-    Args:
-        scene: The scene, with its training views and those that are scored.
-        frame: The field's frame; None if none could be estimated.
-    """
+    """Problems of cameras and times, and views that two splits share."""
     train = scene.splits["train"]
     yield from _times(scene, train)
     yield from shared(scene)
@@ -84,7 +79,7 @@ def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
 
 
 def scene_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
-    """Problems that a run warns about before training; arguments as for `camera_findings`."""
+    """Problems that a run warns about before training."""
     yield from camera_findings(scene, frame)
     yield from opaque_findings(scene)
     views = scene.splits["train"]

@@ -153,11 +153,7 @@ def load_run(
 
 
 def read_experiment(run: Path, plugins: Sequence[str] = ()) -> Experiment:
-    """The settings of a run directory.
-
-    Args:
-        run: The run directory.
-        plugins: User modules with classes that the settings may name.
+    """The settings of a run, which may name classes of ``plugins``.
 
     Raises:
         ConfigError: If they are missing, damaged, or from another version.

@@ -294,7 +294,6 @@ def published_tables(folder: Path) -> list[str]:
     for place, _ in _groups(folder):
         content = _mapping(place / "multirun.yaml", []) or {}
         with suppress(KeyError, TypeError):
-            # Early sweeps of version 0.3 have it at the top level.
-            own = content.get("published") or content["hydra"]["callbacks"]["table"]["published"]
+            own = content["hydra"]["callbacks"]["table"]["published"]
             found += [name for name in own if name not in found]
     return found

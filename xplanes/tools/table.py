@@ -277,16 +277,10 @@ class SweepTable(Callback):
 
 
 def choose_gpu(job: int, environment: MutableMapping[str, str]) -> str | None:
-    """Choose a GPU for a parallel job: job number modulo number of GPUs.
+    """Set ``CUDA_VISIBLE_DEVICES`` to the GPU of a parallel job; None if there are fewer than two.
 
-    A process keeps the GPU of its first job, because CUDA reads ``CUDA_VISIBLE_DEVICES`` only once.
-
-    Args:
-        job: Number of the job within the sweep.
-        environment: Environment; its ``CUDA_VISIBLE_DEVICES`` is read, and set to the chosen GPU.
-
-    Returns:
-        The GPU; None if there are fewer than two.
+    It is job number modulo number of GPUs. A process keeps the GPU of its first job, because CUDA
+    reads the variable only once.
     """
     listed = environment.get("CUDA_VISIBLE_DEVICES")
     if listed is None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from xplanes.errors import ConfigError, SceneError
-from xplanes.evaluation.render import render_path, write_video
+from xplanes.evaluation.render import Track, render_path, write_video
 from xplanes.experiment import Experiment
 from xplanes.fields import XPlanes
 from xplanes.fields.xplanes import SPACE_PLANES
@@ -109,12 +109,9 @@ def find_pictures(paths: Sequence[Path]) -> list[Path]:
 
 
 def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[Tensor]:
-    """Frames of a camera orbit that begins at the model's canonical camera.
+    """Frames of a camera orbit around triplanes [T, 3, C, H, H], one after another.
 
-    Args:
-        triplanes: One or more triplanes, shown one after another. [T, 3, C, H, H]
-        model: The LRM that produced them.
-        device: Device to render on.
+    It begins at the canonical camera of the LRM that produced them.
 
     Yields:
         Images with a white background. uint8 [SIDE, SIDE, 3]
@@ -138,6 +135,5 @@ def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[T
             azimuth = math.degrees(math.atan2(y, x)) + 360 * number / FRAMES
             pose = camera_around(azimuth, 0.0, view.distance).float()
             cameras.append(PosedCamera(pose, view.focal * SIDE, SIDE, SIDE))
-        path, white = (cameras, torch.zeros(len(cameras))), torch.ones(3)
-        renderer = GridRenderer(grid, SAMPLES)
-        yield from render_path(field, renderer, frame, *path, background=white)
+        track, white = Track(cameras, torch.zeros(len(cameras))), torch.ones(3)
+        yield from render_path(field, GridRenderer(grid, SAMPLES), frame, track, background=white)

@@ -57,12 +57,9 @@ def camera_pose(wxyz: Tensor, position: Tensor) -> Tensor:
 
 
 def check_address(host: str, port: int, *, key: str) -> None:
-    """Check that an address can be served.
+    """Check that an address can be served; port 0 is any free one.
 
-    Args:
-        host: Name or address of this machine.
-        port: From 0 to 65535; 0 for any free one.
-        key: Name of the settings in messages; ``host`` or ``port`` replaces the braces.
+    In ``key``, the settings' name in messages, ``host`` or ``port`` replaces the braces.
 
     Raises:
         ConfigError: If the port is taken or out of range, or the host is not this machine.

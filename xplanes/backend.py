@@ -31,11 +31,7 @@ COMPILING = 20
 
 @dataclass
 class WarmUp:
-    """Time spent loading and compiling the inner loops; the stages of a run exclude it.
-
-    Attributes:
-        seconds: Total in this process.
-    """
+    """Seconds spent loading and compiling the inner loops; the stages of a run exclude them."""
 
     seconds: float = 0.0
     _inside: bool = False

@@ -85,12 +85,9 @@ def further_commands() -> list[AddCommands]:
 
 
 class Command(NamedTuple):
-    """A command of the program.
+    """Help of a command, its arguments as `add_argument` takes them, and what runs it.
 
-    Attributes:
-        text: Help text.
-        arguments: Positional arguments and options by name, as `add_argument` takes them.
-        run: Runs it with the parsed options; None where Hydra reads the command line.
+    Nothing runs it here where Hydra reads the command line.
     """
 
     text: str

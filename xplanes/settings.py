@@ -18,13 +18,7 @@ from xplanes.errors import ConfigError
 
 @dataclass(frozen=True)
 class Range:
-    """Bounds of a number.
-
-    Attributes:
-        low: Lower bound.
-        high: Upper bound.
-        open: Whether the bounds themselves are excluded.
-    """
+    """Bounds of a number, which are themselves excluded if it is open."""
 
     low: float = -math.inf
     high: float = math.inf

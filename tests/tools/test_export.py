@@ -328,7 +328,6 @@ def test_times():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"form": "obj"}, "--format obj"),
         ({"resolution": 4}, "--resolution 4: must lie between 8 and"),
         ({"count": 0}, "--points 0"),
         ({"threshold": -1.0}, "--threshold -1"),

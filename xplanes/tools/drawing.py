@@ -34,7 +34,7 @@ RED = (0.9, 0.1, 0.1)
 
 @dataclass(frozen=True)
 class Shot:
-    """Camera, time and mode of a picture.
+    """Camera, time and mode, one of `MODES`, of a picture.
 
     Attributes:
         pose: Camera-to-world matrix, in the field's frame. [4, 4]
@@ -42,7 +42,6 @@ class Shot:
         fov: Vertical field of view, in radians.
         height: Rows.
         aspect: Columns per row.
-        mode: One of `MODES`.
         box: Least and largest corner of the crop, in the field's frame; None for all. [2, 3]
     """
 

@@ -28,7 +28,6 @@ from xplanes.tools.runs import TrainedRun
 
 KINDS = ("mesh", "points", "planes", "path", "web")
 """Values of ``--what`` for any field; a field can add others with its `exports`."""
-FORMATS = ("ply", "glb")
 
 TIMES, WEB_TIMES = 10, 24
 """Default number of timesteps of a dynamic scene, for files and for a web page."""
@@ -82,8 +81,6 @@ class ExportOptions:
             ConfigError: If an option is invalid; the message says what is allowed.
             MissingExtraError: For meshes and points without the extra ``export``.
         """
-        if self.form not in FORMATS:
-            raise ConfigError(f"--format {self.form}: must be {' or '.join(FORMATS)}")
         require_between("--resolution", self.resolution, COARSEST, LARGEST)
         require_between("--points", self.count, 1, 10**8)
         if self.threshold is not None and not 0 < self.threshold < math.inf:

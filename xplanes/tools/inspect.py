@@ -47,14 +47,10 @@ NATIVE = "data.resolution=null"
 
 @dataclass(frozen=True)
 class Choice:
-    """The settings with which a capture is read.
+    """The settings with which a capture is read; ``overrides`` of train.py read the same.
 
-    Attributes:
-        overrides: Settings of train.py that read the same capture.
-        scene: The settings of the scene.
-        model: The settings of the model, for the field's frame and the resolution of its planes.
-        usual_width: Width of the images in the format's YAML file, if the native size is read by
-            default instead; None otherwise.
+    The usual width is that of the images in the format's YAML file, if the native size is read by
+    default instead; None otherwise.
     """
 
     overrides: tuple[str, ...]
@@ -70,8 +66,8 @@ class Capture:
     Attributes:
         choice: The settings with which it was read.
         scene: The scene.
-        frame: The field's frame; None if it cannot be determined.
-        problem: Why the frame cannot be determined; empty if it can.
+        frame: The field's frame; None if it cannot be determined, for the reason in ``problem``.
+        problem: Empty if there is a frame.
         images: Statistics of the pixels of each split's images.
         findings: Possible problems.
         texels: Texels along an axis of the planes; None for fields without planes.
@@ -90,13 +86,7 @@ class Capture:
 
 @dataclass(frozen=True)
 class CameraGroup:
-    """The views of one physical camera, judged by poses and lenses.
-
-    Attributes:
-        name: Folder of the views if it distinguishes the cameras, else a number.
-        indices: Indices of the views.
-        fixed: Whether the camera is static.
-    """
+    """The views of one physical camera; its name is their folder if that distinguishes cameras."""
 
     name: str
     indices: list[int]

@@ -26,18 +26,10 @@ LISTED = 5
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """A run with its scene and trained field.
+    """A run with its scene and the field of its ``last`` or ``best`` checkpoint.
 
-    Attributes:
-        path: The run directory.
-        experiment: The settings.
-        scene: The scene, with the training views and one more split; poses that training has
-            corrected are corrected.
-        split: Name of the other split.
-        frame: The field's frame.
-        module: The trained module, in evaluation mode.
-        checkpoint: ``last`` or ``best``.
-        step: Step of the checkpoint.
+    The scene has the training views and those of ``split``; poses that training has corrected are
+    corrected. The module is in evaluation mode.
     """
 
     path: Path

@@ -20,6 +20,7 @@ from xplanes.config import key_and_value, without
 from xplanes.errors import ConfigError
 from xplanes.files import natural
 from xplanes.files import read_rows as read_csv
+from xplanes.readers.entries import is_number
 from xplanes.settings import flatten
 
 
@@ -232,11 +233,6 @@ def _scores(metrics: dict[str, Any]) -> dict[str, float]:
         if parts and all(map(is_number, parts)):
             found[name] = sum(parts)
     return found
-
-
-def is_number(value: Any) -> bool:
-    """Whether a setting or score is a number; booleans are not."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def run_overrides(run: Path) -> list[str]:

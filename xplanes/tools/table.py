@@ -23,9 +23,10 @@ from xplanes.errors import ConfigError
 from xplanes.files import replacing, write_json, write_rows, write_text
 from xplanes.metrics import mean
 from xplanes.process import say
+from xplanes.readers.entries import is_number
 from xplanes.tools.published import beside, check_published
 from xplanes.tools.sheet import check_what, write_sheet
-from xplanes.tools.sweep import Point, RunRow, is_number, published_tables, read_rows
+from xplanes.tools.sweep import Point, RunRow, published_tables, read_rows
 from xplanes.tools.tabulate import (
     SCENE,
     SEED,

@@ -305,19 +305,12 @@ class Viewer:
 
 @dataclass
 class _Browser:
-    """State of one connected browser.
+    """State of one connected browser; ``client`` is viser's handle.
 
-    Attributes:
-        viewer: The viewer.
-        client: Viser's handle of the browser.
-        version: Number of changes of its camera and the controls.
-        changed: Time of the last change.
-        drawn: ``version`` of its last picture.
-        step: Training step of its last picture.
-        sharp: Whether its last picture has the full size.
-        began: Time at which rendering of its last picture began.
-        again: Earliest time of the next picture, if only the field has changed.
-        rate: Rendering speed in pixels per second.
+    ``version`` counts changes of its camera and the controls, the last of which was at ``changed``.
+    Its last picture is of version ``drawn`` and training step ``step``, was ``began`` then, and is
+    ``sharp`` if it has the full size. If only the field changes, the next one waits until
+    ``again``. The rate is in pixels per second.
     """
 
     viewer: Viewer

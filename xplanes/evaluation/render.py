@@ -23,8 +23,7 @@ from xplanes.scenes.views import Scene, Views
 if TYPE_CHECKING:
     from xplanes.training.module import RadianceModule
 
-ELEVATION = 20.0
-"""Elevation of the orbiting camera, in degrees."""
+ELEVATION = 20.0  # Elevation of the orbiting camera, in degrees.
 
 
 def orbit_poses(views: Views, frame: Frame, count: int, elevation: float = ELEVATION) -> Tensor:
@@ -189,17 +188,10 @@ def _write_image(path: Path, frame: Tensor) -> None:
 IMAGES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 """Pillow's names of the formats for single frames."""
 
-FRAMES, FPS = 48, 16
-"""Number of frames of a run's video, and frames per second."""
-
-VIDEO_SIZE = 200
-"""Maximum side length in pixels of a run's video."""
-
-SHOWN = 0.5
-"""Share of the timesteps that a camera must show for a video to stay with it."""
-
-FEW_CAMERAS = 4
-"""Largest number of calibrations for which each is assumed to be a separate camera."""
+FRAMES, FPS = 48, 16  # Number of frames of a run's video, and frames per second.
+VIDEO_SIZE = 200  # Maximum side length in pixels of a run's video.
+SHOWN = 0.5  # Share of the timesteps that a camera must show for a video to stay with it.
+FEW_CAMERAS = 4  # Largest number of calibrations for which each is assumed to be a separate camera.
 
 
 def training_path(views: Views, count: int) -> tuple[list[int], Tensor]:

@@ -28,14 +28,9 @@ from xplanes.training.fit import Estimate, Trainer
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, blank_psnr, mean_colour, mean_scores
 
-LITTLE = 0.5
-"""Gain in dB over background-only images below which a run has learnt nothing."""
-
-LONG = 30.0
-"""Seconds of scores and images above which the header may say how to shorten them."""
-
-BUSY = 0.6
-"""CPU time per second of training on the CPU below which a run warns."""
+LITTLE = 0.5  # Gain in dB over background-only images below which a run has learnt nothing.
+LONG = 30.0  # Seconds of scores and images above which the header may say how to shorten them.
+BUSY = 0.6  # CPU time per second of training on the CPU below which a run warns.
 
 CLUTTERED = 0.2
 """Share of floaters above which a run warns; successful scenes have less than a tenth."""

@@ -17,8 +17,7 @@ from xplanes.scenes.views import Views
 
 logger = logging.getLogger(__name__)
 
-OVERSHOOT = 0.25
-"""Tolerance of times beyond 0 and 1: splines through key frames overshoot."""
+OVERSHOOT = 0.25  # Tolerance of times beyond 0 and 1: splines through key frames overshoot.
 
 
 @dataclass(frozen=True)
@@ -127,8 +126,7 @@ def path_contents(views: Views, fps: int) -> dict[str, dict[str, Any]]:
     }
 
 
-Entries = dict[str, Mapping[str, Any]]
-"""Cameras of a path by their names in messages."""
+Entries = dict[str, Mapping[str, Any]]  # Cameras of a path by their names in messages.
 
 
 def _entries(path: Path, content: Mapping[str, Any], key: str) -> Entries:

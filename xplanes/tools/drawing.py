@@ -20,11 +20,8 @@ from xplanes.training.scores import VISIBLE
 
 MODES = ("colour", "depth", "opacity", "floaters")
 
-NEAREST = 4
-"""Number of training images, nearest in time, whose silhouettes identify floaters."""
-
-MOST_CAMERAS = 100
-"""Most training cameras that are drawn."""
+NEAREST = 4  # Number of training images, nearest in time, whose silhouettes identify floaters.
+MOST_CAMERAS = 100  # Most training cameras that are drawn.
 
 SLACK = 0.02
 """Margin around silhouettes, in the field's frame, within which nothing counts as a floater."""

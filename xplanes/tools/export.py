@@ -32,17 +32,10 @@ KINDS = ("mesh", "points", "planes", "path", "web")
 TIMES, WEB_TIMES = 10, 24
 """Default number of timesteps of a dynamic scene, for files and for a web page."""
 
-POINTS = 100_000
-"""Default number of points of a point cloud."""
-
-PAGE = "index.html"
-"""File name of a web page."""
-
-COARSEST = 8
-"""Least grid points along each side of the cube."""
-
-LARGEST = 1024
-"""Most grid points along each side of the cube; this many take 4 GB."""
+POINTS = 100_000  # Default number of points of a point cloud.
+PAGE = "index.html"  # File name of a web page.
+COARSEST = 8  # Least grid points along each side of the cube.
+LARGEST = 1024  # Most grid points along each side of the cube; this many take 4 GB.
 
 CAMERAS, RAYS, SAMPLES = 8, 4096, 256
 """Training cameras, rays per camera and samples per ray for the comparison of silhouettes."""
@@ -50,11 +43,8 @@ CAMERAS, RAYS, SAMPLES = 8, 4096, 256
 THINNEST, DENSEST, CANDIDATES = 1e-3, 5.0, 96
 """Smallest and largest threshold, as optical depths of a grid cell, and number of candidates."""
 
-PLATEAU = 0.001
-"""Intersections over union that differ by less count as equal."""
-
-EXACT = "_EXACT"
-"""Name under which trimesh writes linear colours in single precision."""
+PLATEAU = 0.001  # Intersections over union that differ by less count as equal.
+EXACT = "_EXACT"  # Name under which trimesh writes linear colours in single precision.
 
 Z_UP_TO_Y_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 """Rotation from coordinates with z up, which xplanes uses, to y up."""

@@ -23,26 +23,13 @@ from xplanes.rendering.box import ray_box
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene, Views, spread
 
-COARSE = 8.0
-"""Image pixels per texel above which planes lose much of the images' detail."""
-
-CUT = 0.02
-"""Share of the foreground outside of the cube above which a warning is given."""
-
-PALE = 0.15
-"""Share of the silhouettes with the background's colour above which a warning is given."""
-
-EMPTY = 1e-3
-"""Share of opaque pixels below which an image is almost empty."""
-
-FULL = 0.98
-"""Share of opaque pixels above which a mask hides almost nothing."""
-
-MOST_VIEWS = 300
-"""Most images that are read per split, evenly spaced."""
-
-MOST_RAYS = 4096
-"""Most foreground pixels of an image whose rays are tested against the cube."""
+COARSE = 8.0  # Image pixels per texel above which planes lose much of the images' detail.
+CUT = 0.02  # Share of the foreground outside of the cube above which a warning is given.
+PALE = 0.15  # Share of the silhouettes with the background's colour above which a warning is given.
+EMPTY = 1e-3  # Share of opaque pixels below which an image is almost empty.
+FULL = 0.98  # Share of opaque pixels above which a mask hides almost nothing.
+MOST_VIEWS = 300  # Most images that are read per split, evenly spaced.
+MOST_RAYS = 4096  # Most foreground pixels of an image whose rays are tested against the cube.
 
 
 @dataclass(frozen=True)

@@ -35,14 +35,12 @@ from xplanes.tools.tabulate import markdown
 CONSEQUENCES = {"axes": ("cut",), "scale": ("cut", "texels"), "astray": ("cut",)}
 """Findings that are consequences of another one, and not shown with it."""
 
-ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".xz", ".7z", ".rar")
-"""Endings of archives."""
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".xz", ".7z", ".rar")  # Endings of archives.
 
 STAMPED = "; programs write it for static scenes as well: data.static=true if nothing moves"
 """What is said of times from "timestamp"."""
 
-NATIVE = "data.resolution=null"
-"""The setting that reads images at their native size."""
+NATIVE = "data.resolution=null"  # The setting that reads images at their native size.
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from xplanes.scenes.views import Views, spread
 from xplanes.tools.inspect import CameraGroup, Capture, cameras_of
 
 WIDTH, HEIGHT, MARGIN = 1600, 960, 24
-SCALE = 2
-"""Supersampling factor of the picture, for anti-aliased lines and letters."""
+SCALE = 2  # Supersampling factor of the picture, for anti-aliased lines and letters.
 
 INK, FAINT, PAPER, PANEL = "#1f2933", "#9aa5b1", "#ffffff", "#f5f7fa"
 SPLITS = {"train": "#2b6cb0", "val": "#d97706", "test": "#2f855a"}
@@ -26,8 +25,7 @@ OTHER, ASTRAY, CUBE, GAP = "#6b46c1", "#d64545", "#c026a3", "#f9d6d5"
 POINT = "#627d98"
 MOST_FRUSTA, MOST_RAYS, MOST_STRIPS, SAMPLES = 80, 3, 12, 6
 MOST_POINTS = 3000
-EDGE_POINTS = 48
-"""Points along an edge of the cube; distortion makes edges curved."""
+EDGE_POINTS = 48  # Points along an edge of the cube; distortion makes edges curved.
 
 Box = tuple[float, float, float, float]
 """Left, top, right and bottom, in pixels of the finished picture."""

@@ -32,14 +32,12 @@ from xplanes.scenes.views import Scene, Views
 from xplanes.tools.camera_path import CameraPath, read_camera_path
 from xplanes.tools.runs import TrainedRun
 
-OWN = "own"
-"""Value of ``--time`` for the time of the view that ``--path`` names."""
+OWN = "own"  # Value of ``--time`` for the time of the view that ``--path`` names.
 
 PATHS = ("auto", "orbit", "fixed", "cameras")
 """Values of ``--path`` other than names of views or files."""
 
-LARGEST = 8192
-"""Most pixels per side; WebP allows twice as many."""
+LARGEST = 8192  # Most pixels per side; WebP allows twice as many.
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,9 @@ WHAT = ("runs", "steps", "parts")
 """runs: a row per scene, a column per run. steps: a row per run, a column per step. parts: low-rank
 and sparse part of each run's triplanes."""
 
-LINE, GAP = 16, 4
-"""Height of a line of text and gap between tiles, in pixels."""
-
-FPS, HELD = 2, 4
-"""Frames per second of a video, and how many times its last frame is repeated."""
-
-Line = tuple[str, Sequence[Image.Image]]
-"""A row of tiles with its title."""
+LINE, GAP = 16, 4  # Height of a line of text and gap between tiles, in pixels.
+FPS, HELD = 2, 4  # Frames per second of a video, and how many times its last frame is repeated.
+Line = tuple[str, Sequence[Image.Image]]  # A row of tiles with its title.
 
 _STEP = re.compile(r"step(\d+)")
 _TWICE = re.compile(r"^(train|val|test)_(?=\1_)")

@@ -24,22 +24,17 @@ from xplanes.training.module import RadianceModule
 HOST, PORT = "127.0.0.1", 8080
 SIZES = ("64", "96", "128", "200", "320", "480", "720", "1080")
 SPEEDS = {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0, "4": 4.0}
-LOOP_SECONDS = 4.0
-"""Duration of one playback from time 0 to 1, at speed 1."""
+LOOP_SECONDS = 4.0  # Duration of one playback from time 0 to 1, at speed 1.
 TICK_SECONDS = 0.04
-SETTLE_SECONDS = 0.25
-"""Seconds without camera motion before the picture is rendered at full size."""
+SETTLE_SECONDS = 0.25  # Seconds without camera motion before the picture is rendered at full size.
 MOVING_SECONDS = 0.08
 """Rendering time of a picture, in seconds, while the camera moves or time plays."""
-FEWEST = 16
-"""Least number of rows of a picture."""
+FEWEST = 16  # Least number of rows of a picture.
 REFRESH_SECONDS, SHARE = 0.5, 3
 """A picture of a field in training is refreshed after this number of seconds, but not before this
 multiple of its rendering time."""
-AWAY = 1.4
-"""Initial camera distance from the scene, relative to that of the training cameras."""
-FRUSTUM = 0.1
-"""Length of the cameras' frusta, relative to their median distance from the scene."""
+AWAY = 1.4  # Initial camera distance from the scene, relative to that of the training cameras.
+FRUSTUM = 0.1  # Length of the cameras' frusta, relative to their median distance from the scene.
 LARGEST_DEPTH = 160.0
 """Depth is clamped to this value, just below the largest that viser can encode."""
 GREY = (120, 120, 120)

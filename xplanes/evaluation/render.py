@@ -82,15 +82,9 @@ def render_path(
     background: Tensor,
     what: str = "colour",
 ) -> Iterator[Tensor]:
-    """Render frames along a path of cameras and times, one at a time.
+    """Render the frames of a video, one at a time.
 
-    Args:
-        field: A field that the renderer accepts.
-        renderer: The renderer.
-        frame: The field's frame.
-        track: Cameras and times.
-        background: Colour behind the scene. [3]
-        what: ``colour``, or ``depth`` as colours on the same scale in all frames.
+    ``what`` is ``colour``, or ``depth`` as colours on the same scale in all frames.
 
     Yields:
         Pictures. uint8 [rows, columns, 3]

@@ -35,10 +35,8 @@ Metric = Callable[[Tensor, Tensor], float]
 def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
     """Compute scores of all views of the run's split, with the same code as in training.
 
-    Args:
-        trained: The run.
-        network: Backbone of LPIPS, ``vgg`` or ``alex``, downloaded if necessary; ``none`` for no
-            LPIPS; None for vgg if it is already downloaded.
+    The backbone of LPIPS is ``vgg`` or ``alex``, downloaded if necessary; ``none`` for no LPIPS;
+    None for vgg if it is already downloaded.
 
     Returns:
         Content for `write_scores`: scores with the keys of metrics.json, and ``not_computed``, a
@@ -110,13 +108,9 @@ class UnavailableError(Exception):
 
 
 def lpips(network: str, side: int, device: str, *, download: bool) -> Metric:
-    """The LPIPS distance; lower is better.
+    """The LPIPS distance by ``vgg`` or ``alex``, whose values are not comparable; lower is better.
 
-    Args:
-        network: ``vgg`` or ``alex``; their values are not comparable.
-        side: Pixels of the shorter side of the images.
-        device: Device to compute on.
-        download: Whether to download the backbone's weights if they are missing.
+    The images' shorter side has ``side`` pixels.
 
     Raises:
         UnavailableError: If a package, the weights or the images' size rule it out.

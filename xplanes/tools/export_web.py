@@ -150,10 +150,7 @@ def _packed_shape(shape: Shape) -> dict[str, Any]:
 
 
 def packed(values: np.ndarray) -> bytes:
-    """Arrange unsigned integers as bytes that compress well; the page has the inverse.
-
-    Args:
-        values: Little-endian. [N, C]
+    """Arrange little-endian integers [N, C] as bytes that compress well; the page has the inverse.
 
     Returns:
         Differences between rows, modulo the type's range, column by column; each column has all

@@ -41,15 +41,10 @@ from xplanes.tools.tabulate import (
 
 
 def write_tables(folder: Path, out: Path | None = None) -> str:
-    """Tabulate all runs in a folder.
+    """Tabulate all runs in a folder; return the content of table.md.
 
-    Args:
-        folder: A sweep, or any folder of runs.
-        out: Output folder; ``folder`` when None. It gets table.md, table.csv, table_seeds.csv (if
-            there are several seeds), and with the extra ``plots`` curves.png and against.png.
-
-    Returns:
-        Content of table.md.
+    ``out``, by default the folder itself, gets table.md, table.csv, table_seeds.csv (if there are
+    several seeds), and with the extra ``plots`` curves.png and against.png.
 
     Raises:
         ConfigError: If there are no runs in the folder.

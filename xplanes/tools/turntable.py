@@ -32,15 +32,10 @@ SAMPLES, CELLS = 192, 64  # Steps along the diagonal; cells of the grid per side
 
 
 def write_triplanes(paths: Sequence[Path], out: Path, experiment: Experiment) -> Path:
-    """Encode images into triplanes; write them and a turntable video.
+    """Encode images, or folders of them, into triplanes; write them and a turntable video.
 
-    Args:
-        paths: Images, or folders of them.
-        out: File to write, .safetensors or .pt; the video has the same name with .webp.
-        experiment: Settings of the LRM, the cache and the device; others are ignored.
-
-    Returns:
-        The video file.
+    The video has the name of ``out``, .safetensors or .pt, with .webp, and is returned. Of the
+    settings only those of the LRM, the cache and the device are used.
 
     Raises:
         ConfigError, LRMError, SceneError: If a setting, the weights or an image cannot be used.

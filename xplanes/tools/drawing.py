@@ -21,7 +21,6 @@ from xplanes.training.scores import VISIBLE
 MODES = ("colour", "depth", "opacity", "floaters")
 
 NEAREST = 4  # Number of training images, nearest in time, whose silhouettes identify floaters.
-MOST_CAMERAS = 100  # Most training cameras that are drawn.
 
 SLACK = 0.02
 """Margin around silhouettes, in the field's frame, within which nothing counts as a floater."""
@@ -189,33 +188,3 @@ def ruled_out(views: Views, frame: Frame, time: float) -> Callable[[Tensor], Ten
         return ~held.to(points.device)
 
     return found
-
-
-def camera_outlines(views: Views, frame: Frame, length: float) -> tuple[Tensor, Tensor]:
-    """Frusta of training cameras as lines; with distortion their borders are curved.
-
-    Args:
-        views: Training views; at most `MOST_CAMERAS` of them, evenly spaced, are drawn.
-        frame: The field's frame.
-        length: Distance from a camera's centre to its image's corners, in the field's frame.
-
-    Returns:
-        Ends of line segments in the field's frame [L, 2, 3], and the time of each [L].
-    """
-    lines, times = [], []
-    for index in spread(MOST_CAMERAS, len(views)):
-        height, width = views.size(index)
-        steps = 1 if views.intrinsics.lens(index) is None else 8
-        share = torch.arange(steps) / steps
-        # Along the top, down the right side, back along the bottom, and up the left side.
-        there, back, none, all_ = share, 1 - share, torch.zeros(steps), torch.ones(steps)
-        columns = torch.cat([there, all_, back, none]) * width - 0.5
-        rows = torch.cat([none, there, all_, back]) * height - 0.5
-        number = torch.full_like(rows, index, dtype=torch.long)
-        origins, directions = frame.rays(*views.pixel_rays(number, rows, columns))
-        border = origins + length * directions
-        around = torch.stack([border, border.roll(-1, dims=0)], dim=1)
-        corners = torch.stack([origins, border], dim=1)[::steps]
-        lines += [around, corners]
-        times.append(views.times[index].expand(len(around) + len(corners)))
-    return torch.cat(lines), torch.cat(times)

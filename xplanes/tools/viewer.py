@@ -17,8 +17,8 @@ from xplanes.errors import ConfigError
 from xplanes.evaluation.render import orbit_poses
 from xplanes.optional import require
 from xplanes.rendering.pictures import colour_map, to_bytes
-from xplanes.scenes.views import Scene
-from xplanes.tools.drawing import MODES, Picture, Shot, camera_outlines, draw
+from xplanes.scenes.views import Scene, spread
+from xplanes.tools.drawing import MODES, Picture, Shot, draw
 from xplanes.training.module import RadianceModule
 
 HOST, PORT = "127.0.0.1", 8080
@@ -34,7 +34,8 @@ REFRESH_SECONDS, SHARE = 0.5, 3
 """A picture of a field in training is refreshed after this number of seconds, but not before this
 multiple of its rendering time."""
 AWAY = 1.4  # Initial camera distance from the scene, relative to that of the training cameras.
-FRUSTUM = 0.1  # Length of the cameras' frusta, relative to their median distance from the scene.
+FRUSTUM = 0.04  # Size of the cameras' frusta, relative to their median distance from the scene.
+MOST_CAMERAS = 100  # Most training cameras that are drawn.
 LARGEST_DEPTH = 160.0
 """Depth is clamped to this value, just below the largest that viser can encode."""
 GREY = (120, 120, 120)
@@ -238,16 +239,32 @@ class Viewer:
         self.cameras.on_update(lambda _: self._show_cameras())
 
     def _add_cameras(self) -> None:
-        away = self.frame.points(self.views.camera_to_world[:, :3, 3]).norm(dim=-1).median()
-        lines, times = camera_outlines(self.views, self.frame, FRUSTUM * float(away))
-        colours = to_bytes(colour_map(times))[:, None].expand_as(lines)
-        scene = self.server.scene
-        style: Any = {"thickness": 1.5, "thickness_units": "screen"}
-        self.frusta = scene.add_line_segments("/cameras", lines.numpy(), colours.numpy(), **style)
+        views, scene = self.views, self.server.scene
+        lines: Any = {"thickness": 1.5, "thickness_units": "screen"}
+        places = self.frame.points(views.camera_to_world[:, :3, 3])
+        # To the field's frame, and from OpenGL to OpenCV axes.
+        turns = self.frame.rotation @ views.camera_to_world[:, :3, :3] * torch.tensor([1, -1, -1])
+        turns = require("viser.transforms", extra="viewer").SO3.from_matrix(turns.numpy()).wxyz
+        size, pinhole = views.intrinsics.size, views.intrinsics.pinhole
+        heights = 2 * (0.5 * size[:, 0] / pinhole[:, 1]).atan()
+        colours = to_bytes(colour_map(views.times)).numpy()
+        self.frusta = [
+            scene.add_camera_frustum(
+                f"/cameras/{index}",
+                fov=float(heights[index]),
+                aspect=float(size[index, 1] / size[index, 0]),
+                scale=FRUSTUM * float(places.norm(dim=-1).median()),
+                color=colours[index],
+                wxyz=turns[index],
+                position=places[index].numpy(),
+                **lines,
+            )
+            for index in spread(MOST_CAMERAS, len(views))
+        ]
         corners = torch.cartesian_prod(*3 * [torch.tensor([-0.5, 0.5])])
         pairs = torch.combinations(torch.arange(8))
         edges = corners[pairs[(corners[pairs].diff(dim=1)[:, 0] != 0).sum(dim=1) == 1]]
-        self.outline = scene.add_line_segments("/crop", edges.numpy(), GREY, visible=False, **style)
+        self.outline = scene.add_line_segments("/crop", edges.numpy(), GREY, visible=False, **lines)
 
     def _toggle_play(self) -> None:
         self.playing = not self.playing
@@ -281,7 +298,8 @@ class Viewer:
         self._refresh()
 
     def _show_cameras(self) -> None:
-        self.frusta.visible = self.cameras.value
+        for frustum in self.frusta:
+            frustum.visible = self.cameras.value
         self._refresh()
 
     def _refresh(self) -> None:

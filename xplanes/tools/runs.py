@@ -47,7 +47,7 @@ class TrainedRun:
         return self.scene.splits[self.split]
 
 
-def find_run(path: Path, outputs: Path = OUTPUTS) -> Path:
+def find_run(path: Path) -> Path:
     """Check that ``path`` is a run directory.
 
     Raises:
@@ -60,10 +60,10 @@ def find_run(path: Path, outputs: Path = OUTPUTS) -> Path:
         names = _listed(inside[:LISTED])
         raise ConfigError(f"{path} is a folder of {len(inside)} runs; name one of them:{names}")
     problem = "is not a run directory" if path.exists() else "does not exist"
-    runs = {run.resolve(): run for folder in (outputs, path.parent) for run in find_runs(folder)}
+    runs = {run.resolve(): run for folder in (OUTPUTS, path.parent) for run in find_runs(folder)}
     if not runs:
         raise ConfigError(
-            f"{path} {problem}, and there are no runs in {outputs}: {train_command()}"
+            f"{path} {problem}, and there are no runs in {OUTPUTS}: {train_command()}"
         )
     names = difflib.get_close_matches(path.name, {run.name for run in runs}, n=LISTED)
     near = [run for name in names for run in runs.values() if run.name == name]
@@ -93,17 +93,15 @@ def load_run(
     *,
     checkpoint: str = "last",
     split: str | None = None,
-    device: str | None = None,
     plugins: Sequence[str] = (),
     announce: Callable[[str], None] | None = None,
 ) -> TrainedRun:
-    """Load a trained run from a checkpoint.
+    """Load a trained run from a checkpoint to the CPU, if it was trained there, or a GPU if found.
 
     Args:
         run: The run directory.
         checkpoint: ``last`` or ``best``.
         split: Split to read; None for the split of the run's final scores.
-        device: Device of the field; None to follow ``trainer.accelerator``.
         plugins: User modules with classes that the run's settings may name.
         announce: Receives messages about what is loaded.
 
@@ -112,10 +110,8 @@ def load_run(
     """
     experiment = read_experiment(run, plugins)
     data = replace(experiment.data, root=found_root(run, experiment.data.root))
-    if device is None:
-        # A run that was trained on a GPU may be loaded on a machine without one.
-        wanted = str(experiment.trainer.get("accelerator", "auto"))
-        device = str(find_device("cpu" if wanted == "cpu" else "auto"))
+    # A run that was trained on a GPU may be loaded on a machine without one.
+    device = find_device("cpu" if experiment.trainer.get("accelerator") == "cpu" else "auto")
     path = run / "checkpoints" / f"{checkpoint}.ckpt"
     state = load_checkpoint(path)
     step = state.get("global_step")

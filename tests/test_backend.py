@@ -2,15 +2,13 @@
 
 import os
 import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
 from tests.training.runs import SMALL
-from tests.warm import ROOT, forked
+from tests.warm import ROOT, forked, python
 from xplanes import backend
 from xplanes.backend import COMPILING, WarmUp
 
@@ -98,13 +96,6 @@ def sealed(tmp_path: Path) -> tuple[Path, dict[str, str]]:
     names = ("HOME", "NUMBA_CACHE_DIR", "TRITON_CACHE_DIR", "MPLCONFIGDIR", "XDG_CACHE_HOME")
     others = {"PYTHONPATH": str(package.parent), "PYTHONDONTWRITEBYTECODE": "1"}
     return package, os.environ | {name: f"{file}/{name}" for name in names} | others
-
-
-def python(*arguments: str, **options) -> subprocess.CompletedProcess:
-    """A process of its own, to its end."""
-    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, **options)
-    assert done.returncode == 0, done.stderr
-    return done
 
 
 @pytest.mark.slow

@@ -131,11 +131,7 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
 
 
 def read_settings(cls: type[S], values: Mapping[str, Any]) -> S:
-    """Settings, and those nested in them, from builtins.
-
-    Raises:
-        ConfigError: For a name that does not exist or is missing, or a value out of range.
-    """
+    """Settings, and those nested in them, from builtins; `ConfigError` if any cannot be."""
     cls.require_names(values)
     hints = dict(hints_of(cls))
     return cls(**{name: _nested(name, value, hints[name]) for name, value in values.items()})

@@ -60,11 +60,7 @@ class Job:
 
 
 def prepare(experiment: Experiment, folder: Path) -> Job:
-    """Build the Trainer of a run.
-
-    Raises:
-        ConfigError: If one of its arguments, callbacks or loggers is rejected.
-    """
+    """Build the Trainer of a run; `ConfigError` if it rejects a setting."""
     return Job(experiment, experiment.build_trainer(folder), folder, not folder.exists())
 
 

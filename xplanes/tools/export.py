@@ -100,11 +100,7 @@ def _mesh_tools() -> tuple[Any, Any]:
 
 
 def export_times(text: str) -> list[float]:
-    """Times from "5" (evenly spread from 0 to 1) or "0,0.25,1" (a list).
-
-    Raises:
-        ConfigError: If it is neither.
-    """
+    """Times from "5" (evenly spread from 0 to 1) or "0,0.25,1" (a list); else a `ConfigError`."""
     try:
         if text.isdecimal() and 1 <= int(text) <= 100_000:
             return torch.linspace(0, 1, int(text)).tolist()

@@ -182,11 +182,7 @@ def _recognised(folder: Path, changed: Sequence[str]) -> tuple[Path, str]:
 
 
 def inspect(choice: Choice) -> Capture:
-    """Read a capture and check it.
-
-    Raises:
-        SceneError: If it cannot be used.
-    """
+    """Read a capture and check it; `SceneError` if it cannot be used."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         choice.scene.prepare()
@@ -450,11 +446,7 @@ def _width_of_training(choice: Choice, scene: Scene) -> int | None:
 
 
 def check_out(out: Path, settings: SceneSettings) -> None:
-    """Check the file of the picture.
-
-    Raises:
-        ConfigError: If it is no PNG, or is in the folder of the scene.
-    """
+    """Raise `ConfigError` if the file of the picture is no PNG, or is in the scene's folder."""
     if out.suffix.lower() != ".png":
         raise ConfigError(f"--out {out}: must end in .png")
     folder = settings.folder.resolve()

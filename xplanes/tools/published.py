@@ -28,11 +28,7 @@ def read_published() -> list[Entry]:
 
 
 def check_published(names: object) -> list[str]:
-    """Check names of published tables, and return them.
-
-    Raises:
-        ConfigError: If ``names`` is not a list of names of tables in published.csv.
-    """
+    """The names, if they are a list of tables in published.csv; else a `ConfigError`."""
     known = list(dict.fromkeys(entry["table"] for entry in read_published()))
     if not isinstance(names, list) or any(name not in known for name in names):
         raise ConfigError(

@@ -92,11 +92,7 @@ class VideoOptions:
         return self.fps or written or FPS
 
     def track(self, scene: Scene, frame: Frame) -> Track:
-        """Camera and time of each frame.
-
-        Raises:
-            ConfigError: If there is no such view.
-        """
+        """Camera and time of each frame; `ConfigError` if there is no such view."""
         views, count, time = scene.splits["train"], self.count, self.time
         side = max(views.height, views.width)
         if (path := self.cameras) is not None:
@@ -209,11 +205,7 @@ def render_video(trained: TrainedRun, options: VideoOptions) -> Path:
 
 
 def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:
-    """Find a view by file name, with or without extension; returns its split and its index there.
-
-    Raises:
-        ConfigError: If there is no such view; the message lists similar names.
-    """
+    """Split and index of a view by file name, with or without extension; else a `ConfigError`."""
     known = {file: (v, index) for v in splits.values() for index, file in enumerate(v.files)}
     for file, found in known.items():
         if name in (file, file.rsplit(".", 1)[0]):
@@ -226,11 +218,7 @@ def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:
 
 
 def times(name: str, count: int) -> Tensor:
-    """Time of each frame, from 0 to 1. [F]
-
-    Raises:
-        ConfigError: If ``name`` is neither ``sweep``, ``back-and-forth`` nor a number from 0 to 1.
-    """
+    """Time of each frame: ``sweep``, ``back-and-forth`` or a number; else `ConfigError`. [F]"""
     if name == "sweep":
         return torch.linspace(0, 1, count)
     if name == "back-and-forth":

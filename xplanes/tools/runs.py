@@ -48,11 +48,7 @@ class TrainedRun:
 
 
 def find_run(path: Path) -> Path:
-    """Check that ``path`` is a run directory.
-
-    Raises:
-        ConfigError: If it is not one; the message lists runs of similar names, or the newest.
-    """
+    """The path, if it is a run directory; else a `ConfigError` lists similar or the newest runs."""
     if is_run(path):
         return path
     inside = find_runs(path) if path.is_dir() else []
@@ -141,11 +137,7 @@ def load_run(
 
 
 def read_experiment(run: Path, plugins: Sequence[str] = ()) -> Experiment:
-    """The settings of a run, which may name classes of ``plugins``.
-
-    Raises:
-        ConfigError: If they are missing, damaged, or from another version.
-    """
+    """The settings of a run, which may name classes of ``plugins``; `ConfigError` if unusable."""
     content, version = read_config(run), _record(run).get("xplanes")
     try:
         return Experiment.read(content, plugins)

@@ -99,11 +99,7 @@ class RunRow:
 
 
 def read_rows(folder: Path) -> list[RunRow]:
-    """All runs in a folder, at any depth, and the jobs of sweeps without a run directory.
-
-    Raises:
-        ConfigError: If the folder does not exist or contains no runs.
-    """
+    """All runs below a folder, and jobs without a run; `ConfigError` if there are none."""
     if not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder")
     rows, groups = [], list(_groups(folder))

@@ -82,11 +82,7 @@ def write_triplanes(paths: Sequence[Path], out: Path, experiment: Experiment) ->
 
 
 def find_pictures(paths: Sequence[Path]) -> list[Path]:
-    """Image files; for a folder, all its images in natural order of their names.
-
-    Raises:
-        SceneError: If a path is missing, or there are no images.
-    """
+    """Image files, those of folders in natural order; `SceneError` if there are none."""
     found: list[Path] = []
     for path in paths:
         if path.is_dir():

@@ -105,11 +105,7 @@ class Experiment:
         return devices if isinstance(devices, int) and devices > 0 else 1
 
     def build_trainer(self, run: Path) -> "Trainer":
-        """The Trainer, with callbacks and loggers, for a run directory.
-
-        Raises:
-            ConfigError: If one of them rejects its arguments.
-        """
+        """The Trainer, with callbacks and loggers; `ConfigError` if one rejects its arguments."""
         from lightning.pytorch.callbacks import Callback
 
         from xplanes.training.fit import Trainer

@@ -119,13 +119,8 @@ def export_times(text: str) -> list[float]:
 def export(trained: TrainedRun, options: ExportOptions, out: Path | None = None) -> Path:
     """Export a run for other programs, and list the files in ``export.json``.
 
-    Args:
-        trained: The run.
-        options: Content and format of the export.
-        out: Folder to write into, empty or new; ``export/WHAT`` in the run directory when None.
-
-    Returns:
-        The folder.
+    The folder ``out``, empty or new, is ``export/WHAT`` in the run directory when None; it is
+    returned.
 
     Raises:
         ConfigError: If options are out of range, do not fit the run, or the field shows nothing.

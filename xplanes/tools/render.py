@@ -137,8 +137,7 @@ class VideoOptions:
         """Check the options without a run.
 
         Raises:
-            ConfigError: If an option is invalid; the message says what is allowed.
-            SceneError: If a camera path cannot be used.
+            ConfigError, SceneError: If an option is invalid, or a camera path cannot be used.
             ImportError: For .mp4 without the extra ``video``.
         """
         views = self.path.startswith("view:")
@@ -173,12 +172,7 @@ class VideoOptions:
 
 
 def render_video(trained: TrainedRun, options: VideoOptions) -> Path:
-    """Render and write a video; return its file or folder.
-
-    Raises:
-        ConfigError: If options are out of range or contradict one another.
-        ImportError: For .mp4 without the extra ``video``.
-    """
+    """Render and write a video, and return its file or folder; fails as the options' check does."""
     options.check()
     options = options.chosen_for(trained.scene)
     track = options.track(trained.scene, trained.frame)

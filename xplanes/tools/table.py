@@ -64,9 +64,10 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
         text.append(published)
     if parts := decomposition_table(rows, names):
         text += ["Decomposition of the LRM's triplanes (means over xy, xz, yz):", shown(parts)]
-    if len(rows) > 1 and plot_curves(rows, names, out / "curves.png"):
+    plots = importlib.util.find_spec("matplotlib") is not None
+    if plots and len(rows) > 1 and plot_curves(rows, names, out / "curves.png"):
         text.append("![PSNR against seconds and steps](curves.png)")
-    if plot_against(rows, names, out / "against.png"):
+    if plots and plot_against(rows, names, out / "against.png"):
         text.append("![PSNR at the end](against.png)")
     whole = "\n\n".join(text) + "\n"
     write_text(out / "table.md", whole)
@@ -112,18 +113,14 @@ PLACES = 60
 
 
 def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
-    """Plot PSNR against seconds, preparation included, and against steps, a column per scene.
-
-    Returns:
-        Whether a plot was written: it needs curves and matplotlib (extra ``plots``).
-    """
+    """Plot PSNR against seconds and steps, a column per scene; false if there are no curves."""
     over = [name for name in names if name not in (SEED, SCENE)]
     lines: dict[tuple[str, str], list[tuple[Point, ...]]] = {}
     for row in rows:
         if len(row.curve) > 1:
             key = str(row.settings.get(SCENE, "")), run_label(row, over)
             lines.setdefault(key, []).append(row.curve)
-    if not lines or not importlib.util.find_spec("matplotlib"):
+    if not lines:
         return False
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter
@@ -154,10 +151,9 @@ def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> boo
 
 
 def plot_against(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
-    """Plot final PSNR, as mean over scenes and seeds, against a setting with at least three values.
+    """Plot final PSNR, as mean over scenes and seeds, against a setting of three values or more.
 
-    Returns:
-        Whether a plot was written: it needs exactly one such setting, and matplotlib.
+    False if there is not exactly one such setting.
     """
     done = [row for row in rows if "psnr" in row.scores]
     numeric = {}
@@ -167,7 +163,7 @@ def plot_against(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bo
             # null means all, so it is the last value of the axis.
             places = [math.inf if value is None else float(value) for value in values]
             numeric |= {name: places} if len(set(places)) > 2 else {}
-    if len(numeric) != 1 or not importlib.util.find_spec("matplotlib"):
+    if len(numeric) != 1:
         return False
     from matplotlib.figure import Figure
 

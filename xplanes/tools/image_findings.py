@@ -62,8 +62,7 @@ class ImageFacts:
 
 def image_facts(views: Views, background: Tensor, frame: Frame | None) -> list[ImageFacts]:
     """Statistics of the pixels of at most `MOST_VIEWS` images; colours are from 0 to 1."""
-    chosen = spread(MOST_VIEWS, len(views))
-    return [_facts_of(views, index, background, frame) for index in chosen]
+    return [_facts_of(views, i, background, frame) for i in spread(MOST_VIEWS, len(views))]
 
 
 def _facts_of(views: Views, index: int, background: Tensor, frame: Frame | None) -> ImageFacts:

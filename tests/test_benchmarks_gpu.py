@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests import inside
-from tests.warm import ROOT
+from tests.warm import ROOT, python
 from xplanes.files import read_rows
 
 pytestmark = [
@@ -192,9 +192,7 @@ def test_a_part_that_takes_too_long_is_stopped(gpu, begin, limit, failed):
 @pytest.mark.slow
 def test_the_script_runs_without_a_gpu(tmp_path):
     pytest.importorskip("triton", reason="triton is not installed")
-    script = [sys.executable, str(ROOT / "benchmarks" / "gpu.py"), "--out", str(tmp_path)]
-    done = subprocess.run(script, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
+    done = python(str(ROOT / "benchmarks" / "gpu.py"), "--out", str(tmp_path))
     assert (tmp_path / "gpu.md").read_text(encoding="utf-8") in done.stdout
     figures = rows(tmp_path)
     assert float(figures["training", "random, CPU: PSNR"]["value"]) > 20

@@ -8,8 +8,6 @@ import inspect
 import math
 import pkgutil
 import re
-import subprocess
-import sys
 import tomllib
 from dataclasses import fields
 from graphlib import TopologicalSorter
@@ -28,7 +26,7 @@ from tests.balls import ball_scene
 from tests.baselines.runs import under
 from tests.refusals import assert_refused
 from tests.training.runs import changed, composed
-from tests.warm import forked
+from tests.warm import ROOT, forked, python
 from xplanes.cli import build_parser
 from xplanes.components import MOVED, build
 from xplanes.config import CONF, NAMES, compose_plain, to_plain
@@ -48,8 +46,6 @@ from xplanes.settings import HOME, Range, Settings
 from xplanes.synthetic.pretraining.settings import PretrainingSettings
 from xplanes.training.fit import Trainer
 from xplanes.training.module import RadianceModule
-
-ROOT = Path(__file__).resolve().parents[1]
 
 OPTIONS = sorted(
     (path.parent.relative_to(CONF).as_posix(), path.stem)
@@ -618,10 +614,7 @@ def test_the_core_runs_without_its_wings():
         f"import importlib, sys\nfor name in {sorted(core)}: importlib.import_module(name)\n"
         "print(*sys.modules)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT
-    )
-    loaded = set(done.stdout.split())
+    loaded = set(python("-c", script).stdout.split())
     assert core <= loaded
     assert not {name for name in loaded if room(name) in WINGS and name.startswith("xplanes.")}
 

@@ -2,13 +2,10 @@
 
 import ast
 import inspect
-import os
 import pkgutil
 import re
 import runpy
 import shlex
-import subprocess
-import sys
 from collections.abc import Iterator
 from importlib.util import find_spec
 from itertools import pairwise
@@ -19,7 +16,7 @@ import pytest
 import yaml
 
 from tests.training.runs import changed, small_config
-from tests.warm import ROOT
+from tests.warm import ROOT, python
 from xplanes import __version__
 from xplanes.cli import build_parser, further_commands
 from xplanes.config import compose_plain, near_names
@@ -61,12 +58,8 @@ def test_addresses_and_version_are_the_same_wherever_they_stand(generator):
 @pytest.mark.slow
 @pytest.mark.skipif(not find_spec("mkdocs"), reason="the site needs the extra docs")
 def test_the_site_builds_without_a_warning(tmp_path):
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
-    silent = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
-    built = subprocess.run(
-        command, cwd=ROOT, env=silent, capture_output=True, text=True, check=False
-    )
-    assert built.returncode == 0, built.stderr
+    build = ("-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path))
+    python(*build, env={"NO_MKDOCS_2_WARNING": "1"})
     api = (tmp_path / "api" / "index.html").read_text(encoding="utf-8")
     for name in (
         "training.module.RadianceModule",

@@ -1,9 +1,6 @@
 """What builds, tests and publishes a release: pinned, with few rights, complete."""
 
-import os
 import re
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -12,7 +9,7 @@ import pytest
 import yaml
 
 from tests.training.runs import SMALL
-from tests.warm import ROOT
+from tests.warm import ROOT, python
 
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 
@@ -87,26 +84,11 @@ def test_the_image_runs_as_a_user_without_rights():
 # The wheel, installed without the repository and used from an empty folder
 
 
-def run(*command: str, cwd: Path, **environment: str) -> str:
-    """What a command prints; it must succeed."""
-    done = subprocess.run(
-        command,
-        cwd=cwd,
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder that holds what the wheel installs."""
     place = tmp_path_factory.mktemp("wheel")
-    run(sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(place), cwd=ROOT)
+    python("-m", "hatchling", "build", "-t", "wheel", "-d", str(place))
     (wheel,) = place.glob("xplanes-*.whl")
     with zipfile.ZipFile(wheel) as content:
         content.extractall(place / "site")
@@ -144,7 +126,7 @@ def test_commands_work_from_an_empty_folder(installed, tmp_path):
         ["table", "outputs"],
     ]
     code = COMMANDS.format(commands)
-    printed = run(sys.executable, "-c", code, cwd=tmp_path, **settings)
+    printed = python("-c", code, cwd=tmp_path, env=settings).stdout
     for words in (
         str(installed / "xplanes" / "__init__.py"),
         *("pretrain-lrm", "architecture: openlrm-large-1.1", "psnr", "xplanes train resume="),

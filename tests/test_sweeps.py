@@ -14,13 +14,14 @@ from importlib.util import find_spec
 import pytest
 import torch
 import yaml
-from hydra import compose, initialize_config_dir
+from hydra import initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from hydra_plugins.xplanes import ALIASES
 from tests.balls import ball_scene
 from tests.inside import train
 from tests.test_contracts import built, small
+from tests.test_train_command import with_hydra
 from tests.training.runs import SMALL as SMALL_RUN
 from tests.training.runs import changed
 from xplanes.config import CONF, compose_plain, group_options
@@ -51,9 +52,7 @@ SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml"))
 @functools.cache
 def multirun(*overrides: str) -> DictConfig:
     """The configuration of a multirun."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        composable = [text for text in overrides if "," not in text]
-        config = compose("train", composable, return_hydra_config=True)
+    config = with_hydra(*(text for text in overrides if "," not in text))
     OmegaConf.update(config, "hydra.overrides.task", list(overrides))
     return config
 

@@ -29,7 +29,7 @@ from tests.training.runs import (
     same_state,
     status,
 )
-from tests.warm import ROOT, wait_for
+from tests.warm import ROOT, python, wait_for
 from xplanes import SceneDataModule, launch
 from xplanes import run as whole_run
 from xplanes.components import build
@@ -364,13 +364,6 @@ exec(compile(open({train!r}).read(), {train!r}, "exec"), globals())
 """
 
 
-def train_apart(*arguments: str) -> None:
-    """A Python of its own, to its good end."""
-    command = [sys.executable, *arguments]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240)
-    assert result.returncode == 0, result.stderr
-
-
 @pytest.mark.slow
 def test_two_processes_share_the_rays_and_end_with_one_model(tmp_path):
     root = f"data.root={tmp_path / 'scenes'}"  # Of videos that are as long as usual.
@@ -381,7 +374,7 @@ def test_two_processes_share_the_rays_and_end_with_one_model(tmp_path):
     settings = [root, *SMALL, "trainer=ddp", "trainer.max_steps=20", f"hydra.run.dir={run}"]
     settings += ["callbacks.checkpoints.every=13", "trainer.deterministic=true"]
     settings.append("data.val_views=1")  # Fewer than processes.
-    train_apart(str(script), *settings)
+    python(str(script), *settings)
     state = checkpoint(run)
     assert state["global_step"] == 20
     first, second = (torch.load(tmp_path / f"rank{n}.pt", weights_only=True) for n in range(2))
@@ -395,7 +388,7 @@ def test_two_processes_share_the_rays_and_end_with_one_model(tmp_path):
     assert found["rays_per_second"] == pytest.approx(rays / found["seconds"]["train"])
     # From a step at which the grid is not updated, and before which it has met other samples.
     (tmp_path / "13.ckpt").replace(run / "checkpoints" / "last.ckpt")
-    train_apart(str(script), f"resume={run}")
+    python(str(script), f"resume={run}")
     assert checkpoint(run)["global_step"] == 20
     same_state(first, checkpoint(run)["state_dict"])
 
@@ -420,7 +413,7 @@ def test_two_processes_stop_together_and_resume(tmp_path):
     assert last.stat().st_mtime_ns > before
     step = checkpoint(run)["global_step"]
     assert status(run)["status"] == "interrupted"
-    train_apart(program, f"resume={run}", f"trainer.max_steps={step + 5}")
+    python(program, f"resume={run}", f"trainer.max_steps={step + 5}")
     assert checkpoint(run)["global_step"] == step + 5
 
 

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -47,6 +48,17 @@ def forked(before: str, codes: list[str], folder: Path) -> list[tuple[int, str]]
     status = [int(line) for line in done.stdout.split()]
     assert len(status) == len(codes), done.stderr
     return [(code, (folder / str(number)).read_text()) for number, code in enumerate(status)]
+
+
+def python(
+    *arguments: str, cwd: Path = ROOT, env: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """``python ARGUMENTS`` as a process of its own, to its good end."""
+    whole = os.environ | dict(env or {})
+    command = [sys.executable, *arguments]
+    done = subprocess.run(command, cwd=cwd, env=whole, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done
 
 
 def wait_for(path: Path, process: subprocess.Popen[bytes]) -> None:

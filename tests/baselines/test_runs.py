@@ -53,7 +53,7 @@ def check_run(scenes, folder, gain, stop, overrides):
         run(config, broken, [], resume=True)
         assert scores(broken) == found
         same_state(*(checkpoint(each)["state_dict"] for each in (whole, broken)))
-    trained = load_run(whole, device="cpu")
+    trained = load_run(whole)
     scored = evaluate(trained, "none")["test"]["psnr"]
     assert scored == pytest.approx(content["test"]["psnr"], abs=1e-6)
     assert render_video(trained, VideoOptions(frames=2, size=8)).stat().st_size > 0

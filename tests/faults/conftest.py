@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,7 @@ from typing import Any
 import pytest
 
 from tests.training.runs import outcome, small_config
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.warm import ROOT
 
 SETTINGS = (
     "callbacks.checkpoints.every=3",
@@ -99,13 +99,19 @@ class Nursery:
         return int(self.process.stdout.readline())
 
 
-@pytest.fixture(scope="session")
-def nursery(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nursery]:
-    """Where runs start."""
-    nursery = Nursery(tmp_path_factory.mktemp("logs"))
+@contextmanager
+def nursery_in(folder: Path) -> Iterator[Nursery]:
+    """A place where runs start, with their logs in a folder."""
+    nursery = Nursery(folder)
     yield nursery
     nursery.process.stdin.close()  # type: ignore[union-attr]
-    nursery.process.wait(30)
+    nursery.process.wait(60)
+
+
+@pytest.fixture(scope="session")
+def nursery(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nursery]:
+    with nursery_in(tmp_path_factory.mktemp("logs")) as found:
+        yield found
 
 
 @pytest.fixture(scope="session")
@@ -132,3 +138,16 @@ def whole(
         nursery.run(config_of(shared, lrm, folder / "cache"), folder / "run", resume=False)
         found[lrm] = outcome(folder / "run")
     return found
+
+
+@pytest.fixture
+def recovered(tally: Tally, nursery: Nursery, whole: dict[str, Any]) -> Callable[..., None]:
+    """Checks that a run, which ``config`` lets go on first, came to what a whole one does."""
+
+    def check(folder: Path, lrm: str = "none", config: dict[str, Any] | None = None) -> None:
+        if config is not None:
+            nursery.run(config, folder, resume=(folder / "run.json").is_file())
+        assert outcome(folder) == whole[lrm]
+        tally.recovered()
+
+    return check

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from tests.faults.conftest import config_of
-from tests.training.runs import outcome
 from xplanes.files import StorageError
 from xplanes.launch import prepare
 from xplanes.training.checkpoints import load_checkpoint
@@ -46,7 +45,7 @@ def mount(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("kilobytes", [64, 200, 500, 900, 1300, 1700])
-def test_full_disk(tally, nursery, shared, whole, tmp_path, kilobytes):
+def test_full_disk(tally, recovered, nursery, shared, tmp_path, kilobytes):
     """Disk full, from the first file to the last checkpoint"""
     config = config_of(shared, "none", None)
     folder = tmp_path / "disk" / "run"
@@ -58,13 +57,11 @@ def test_full_disk(tally, nursery, shared, whole, tmp_path, kilobytes):
         last = folder / "checkpoints" / "last.ckpt"
         assert not last.is_file() or load_checkpoint(last)["global_step"] % 3 == 0
         change("size=64m")
-        nursery.run(config, folder, resume=(folder / "run.json").is_file())
-        assert outcome(folder) == whole["none"]
-    tally.recovered()
+        recovered(folder, config=config)
 
 
 @pytest.mark.parametrize("kilobytes", [1, 20, 200, 600])
-def test_limited_files(tally, nursery, shared, whole, tmp_path, kilobytes):
+def test_limited_files(tally, recovered, nursery, shared, tmp_path, kilobytes):
     """Limit on the size of files (ulimit -f)"""
     config = config_of(shared, "none", None)
     folder = tmp_path / "run"
@@ -73,13 +70,11 @@ def test_limited_files(tally, nursery, shared, whole, tmp_path, kilobytes):
     assert child.finish() == 1, child.output()
     error = child.output().split("error: ")[-1]
     tally.said(error, "cannot be written", "ulimit -f")
-    nursery.run(config, folder, resume=(folder / "run.json").is_file())
-    assert outcome(folder) == whole["none"]
-    tally.recovered()
+    recovered(folder, config=config)
 
 
 @pytest.mark.parametrize("what", ["scenes", "cache"])
-def test_full_disk_elsewhere(tally, nursery, shared, whole, tmp_path, what):
+def test_full_disk_elsewhere(tally, recovered, nursery, shared, tmp_path, what):
     """Disk full below data.root or preparation.cache"""
     folder, disk = tmp_path / "run", tmp_path / "disk"
     with small_disk(disk, 40) as change:
@@ -89,29 +84,27 @@ def test_full_disk_elsewhere(tally, nursery, shared, whole, tmp_path, what):
             assert child.finish() == 1, child.output()
             tally.said(child.output().split("error: ")[-1], "cannot be written", "No space left")
             change("size=64m")
-            nursery.run(config, folder, resume=True)
+            recovered(folder, lrm, config=config)
         else:
             # Finished stages are merely not kept.
             lrm, config = "tiny", config_of(shared, "tiny", disk / "cache")
             child = nursery.run(config, folder, resume=False)
             tally.said(child.output(), "cannot be written: stages are not cached")
             assert not list(disk.iterdir())
-        assert outcome(folder) == whole[lrm]
-    tally.recovered()
+            recovered(folder, lrm)
 
 
-def test_log_on_a_full_device(tally, nursery, shared, whole, tmp_path):
+def test_log_on_a_full_device(tally, recovered, nursery, shared, tmp_path):
     """A log that cannot take a line (/dev/full)"""
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "train.log").symlink_to("/dev/full")
     child = nursery.run(config_of(shared, "none", None), folder, resume=False)
     tally.said(child.output(), "psnr")
-    assert outcome(folder) == whole["none"]
-    tally.recovered()
+    recovered(folder)
 
 
-def test_read_only(tally, nursery, shared, whole, tmp_path):
+def test_read_only(tally, recovered, nursery, shared, tmp_path):
     """Read-only output directory, or a file in its place"""
     disk = tmp_path / "disk"
     config = config_of(shared, "none", None)
@@ -125,11 +118,9 @@ def test_read_only(tally, nursery, shared, whole, tmp_path):
         tally.said(child.output(), "Read-only", "Choose a folder")
         assert os.listdir(disk) == []  # noqa: PTH208
         change("rw")
-        nursery.run(config, disk / "run", resume=False)
-        assert outcome(disk / "run") == whole["none"]
+        recovered(disk / "run", config=config)
     (tmp_path / "file").write_text("kept")
     with pytest.raises(StorageError) as caught:
         prepare([f"hydra.run.dir={tmp_path / 'file' / 'run'}"])
     tally.said(str(caught.value), "file is in the place of a folder")
     assert (tmp_path / "file").read_text() == "kept"
-    tally.recovered()

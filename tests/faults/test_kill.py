@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from tests.faults.conftest import Child, config_of
-from tests.training.runs import outcome
 from xplanes.files import MARK
 from xplanes.training.checkpoints import load_checkpoint
 
@@ -36,12 +35,8 @@ def nothing_half_written(folder: Path) -> int:
     return step
 
 
-def go_on(nursery, config, folder: Path) -> None:
-    nursery.run(config, folder, resume=(folder / "run.json").is_file())
-
-
 @pytest.mark.parametrize("number", range(RANDOM_MOMENTS))
-def test_random_times(tally, nursery, shared, whole, tmp_path, number):
+def test_random_times(recovered, nursery, shared, tmp_path, number):
     """kill -9 at random times of a run, lrm=none and lrm=tiny"""
     lrm = ("none", "tiny")[number % 2]
     config = config_of(shared, lrm, tmp_path / "cache")
@@ -58,13 +53,11 @@ def test_random_times(tally, nursery, shared, whole, tmp_path, number):
             break
         assert status == -signal.SIGKILL, child.output()
         nothing_half_written(folder)
-    go_on(nursery, config, folder)
-    assert outcome(folder) == whole[lrm]
-    tally.recovered()
+    recovered(folder, lrm, config=config)
 
 
 @pytest.mark.parametrize("number", range(WRITING))
-def test_while_a_checkpoint_is_written(tally, nursery, shared, whole, tmp_path, number):
+def test_while_a_checkpoint_is_written(recovered, nursery, shared, tmp_path, number):
     """kill -9 while a checkpoint is being written"""
     lrm = ("none", "tiny")[number % 2]
     config = config_of(shared, lrm, tmp_path / "cache")
@@ -79,18 +72,14 @@ def test_while_a_checkpoint_is_written(tally, nursery, shared, whole, tmp_path, 
     kill(child)
     step = nothing_half_written(folder)
     assert step < 40
-    go_on(nursery, config, folder)
-    assert outcome(folder) == whole[lrm]
-    tally.recovered()
+    recovered(folder, lrm, config=config)
 
 
 @pytest.mark.parametrize("wait", [0.1, 0.3, 0.6])
-def test_while_the_scene_is_rendered(tally, nursery, whole, tmp_path, wait):
+def test_while_the_scene_is_rendered(recovered, nursery, tmp_path, wait):
     """kill -9 while the demo scene is rendered"""
     config = config_of(tmp_path, "none", None)
     child = nursery.start(config, tmp_path / "run", resume=False)
     time.sleep(wait)
     kill(child)
-    go_on(nursery, config, tmp_path / "run")
-    assert outcome(tmp_path / "run") == whole["none"]
-    tally.recovered()
+    recovered(tmp_path / "run", config=config)

@@ -15,6 +15,8 @@ from xplanes.settings import Positive
 class BlobField(RadianceField):
     """Density falls with the distance from a centre that moves along a line."""
 
+    precision, outline = "32", "one blob"
+
     def __init__(self, width: float, moves: bool) -> None:
         super().__init__()
         self.centre, self.velocity = nn.Parameter(torch.zeros(3)), nn.Parameter(torch.zeros(3))
@@ -27,14 +29,6 @@ class BlobField(RadianceField):
     @property
     def moves(self) -> bool:
         return self._moves
-
-    @property
-    def precision(self) -> str:
-        return "32"
-
-    @property
-    def outline(self) -> str:
-        return "one blob"
 
     def forward(self, points: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
         centre = self.centre + (times[:, None] - 0.5) * self.velocity

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from xplanes.backend import threads
 from xplanes.errors import ConfigError, SceneError
 from xplanes.lrm import LRMError
 from xplanes.training.diagnosis import TrainingError
@@ -75,7 +76,5 @@ def tally(request: pytest.FixtureRequest) -> Tally:
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
     """One thread, so that the suite takes one core; tests of threads set their own."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+    with threads(1):
+        yield

@@ -12,7 +12,6 @@ from torch import Tensor
 from tests.baselines.test_kplanes_field import products
 from tests.baselines.test_tensor4d_field import surface as tensor4d
 from tests.baselines.test_tineuvox_field import field as tineuvox
-from tests.scenes.test_lenses import lenses_of
 from xplanes.baselines.kplanes.field import DensityField, HybridDecoder, KPlanes
 from xplanes.baselines.proposal import ProposalRenderer
 from xplanes.baselines.tensor4d.neus import NeusRenderer
@@ -22,10 +21,10 @@ from xplanes.rendering.base import RayRenderer
 from xplanes.rendering.grid_renderer import GridRenderer
 from xplanes.rendering.occupancy import OccupancyGrid
 from xplanes.rendering.pictures import depth_picture
-from xplanes.scenes.cameras import look_at, orbit, project
+from xplanes.scenes.cameras import look_at, orbit
 from xplanes.scenes.frame import Frame
-from xplanes.scenes.views import Intrinsics, Views
-from xplanes.tools.drawing import Picture, Shot, camera_outlines, draw, in_box
+from xplanes.scenes.views import Views
+from xplanes.tools.drawing import Picture, Shot, draw, in_box
 
 FLAT = Frame(1.0, torch.eye(3), torch.zeros(3))
 TURN = torch.linalg.qr(torch.tensor([[1.0, 0.5, 0.2], [-0.3, 1.0, 0.4], [0.1, -0.6, 1.0]]))[0]
@@ -244,31 +243,3 @@ def test_drawing_ends_once_it_is_not_wanted():
     more: Any = {"views": views_of(), "frame": FLAT, "background": torch.ones(3), "at_once": 100}
     assert draw(Balls(FRONT), grid_renderer(), shot(), stop=stop, **more) is None
     assert stop.call_count == 3
-
-
-@pytest.mark.parametrize("lens", [False, True])
-def test_outlines_of_cameras_end_at_the_corners_of_their_images(lens):
-    poses = orbit(3, radius=4, elevation=30, target=FRAME.centre)
-    focal = torch.tensor([[30.0, 32.0]]).repeat(3, 1)
-    centre = torch.tensor([[22.0, 11.0]]).repeat(3, 1)
-    lenses = lenses_of(*3 * ["barrel"]) if lens else None
-    intrinsics = Intrinsics(focal, centre, torch.tensor([[24, 40]] * 3), lenses)
-    images = torch.zeros(3, 24, 40, 4, dtype=torch.uint8)
-    views = Views(images, poses, torch.tensor([0.0, 0.5, 1.0]), intrinsics, tuple("abc"))
-    lines, times = camera_outlines(views, FRAME, 0.3)
-    assert times.unique().tolist() == [0, 0.5, 1]
-    assert len(lines) == 3 * (4 + (32 if lens else 4))
-    own = FRAME.to_world(lines[times == 0.5])
-    around, spokes = own[:-4], own[-4:]
-    torch.testing.assert_close(spokes[:, 0], poses[1, :3, 3].expand(4, 3), atol=1e-4, rtol=0)
-    lengths = (spokes[:, 1] - spokes[:, 0]).norm(dim=1) * FRAME.scale
-    torch.testing.assert_close(lengths, torch.full((4,), 0.3), atol=1e-4, rtol=0)
-    column, row, seen = project(
-        poses[1], spokes[:, 1], focal=focal[1], centre=centre[1], lenses=intrinsics.lens(1)
-    )
-    assert seen.all()
-    corners = torch.tensor([[0.0, 0.0], [40, 0], [40, 24], [0, 24]])
-    torch.testing.assert_close(torch.stack([column, row], dim=1), corners, atol=0.01, rtol=0)
-    # The border is closed.
-    torch.testing.assert_close(around[:-1, 1], around[1:, 0])
-    torch.testing.assert_close(around[-1, 1], around[0, 0])

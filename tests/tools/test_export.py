@@ -184,7 +184,7 @@ def test_what_lies_in_empty_cells_is_left_out_and_not_asked_for(tmp_path):
             return super().geometry(points, times)
 
     trained = set_up(tmp_path, Watched(), GridRenderer(grid, 192))
-    mesh = module.surface(trained, 0.5, 32, 10.0)
+    mesh = module._surface(trained, 0.5, 32, 10.0)
     border = 9 / 8 - 1
     assert max(asked) < border
     assert mesh.vertices[:, 0].max() < border + 1 / 16
@@ -197,7 +197,7 @@ def test_the_threshold_is_the_density_of_the_surface(tmp_path, name):
     if name == "fixed step":
         torch.nn.init.normal_(field.grid, std=3)
     trained, resolution = set_up(tmp_path, field, renderer, FLAT), 48
-    volume, _ = module.solidity(trained, 0.5, resolution)
+    volume, _ = module._solidity(trained, 0.5, resolution)
     threshold = float(-torch.log1p(-volume[volume > 0]).median()) * resolution / 2
     _, points = exported(trained, resolution=resolution, threshold=threshold)
     low, high = BOX if name == "fixed step" else torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -328,7 +328,6 @@ def test_times():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"form": "obj"}, "--format obj"),
         ({"resolution": 4}, "--resolution 4: must lie between 8 and"),
         ({"count": 0}, "--points 0"),
         ({"threshold": -1.0}, "--threshold -1"),

@@ -21,7 +21,7 @@ from xplanes.rendering.pictures import to_bytes
 from xplanes.scenes.cameras import PosedCamera
 from xplanes.scenes.views import Views
 from xplanes.tools.camera_path import read_camera_path
-from xplanes.tools.render import VideoOptions, cameras, find_view, render_video, times
+from xplanes.tools.render import VideoOptions, find_view, render_video, times
 from xplanes.tools.runs import TrainedRun
 from xplanes.training.scores import score_view
 
@@ -38,13 +38,13 @@ def test_ways_through_time():
 
 
 def poses(trained: TrainedRun, options: VideoOptions) -> torch.Tensor:
-    seen = cameras(options, trained.scene.splits, trained.frame)
-    return torch.stack([camera.camera_to_world for camera in seen])
+    track = options.track(trained.scene, trained.frame)
+    return torch.stack([camera.camera_to_world for camera in track.cameras])
 
 
 def test_camera_paths(trained):
     centre = trained.frame.centre
-    orbit = poses(trained, VideoOptions(frames=6, elevation=30))
+    orbit = poses(trained, VideoOptions("orbit", frames=6, elevation=30))
     reach = (orbit[:, :3, 3] - centre).norm(dim=-1)
     assert reach.tolist() == pytest.approx([float(reach[0])] * 6, rel=1e-5)
     height = (orbit[:, 2, 3] - centre[2]) / reach
@@ -199,7 +199,7 @@ def test_a_video_of_surroundings_stays_with_the_cameras_by_default(trained):
 
 def test_cameras_of_the_training_views_are_a_path(trained, views):
     options = VideoOptions("cameras", frames=3, size=20)
-    found = cameras(options, trained.scene.splits, trained.frame)
+    found = options.track(trained.scene, trained.frame).cameras
     indices, _ = training_path(views, 3)
     for camera, index in zip(found, indices, strict=True):
         own = views.camera(index)
@@ -271,13 +271,16 @@ def test_a_transforms_file_is_a_path(views, tmp_path):
     assert path.focal(10, 16).tolist() == pytest.approx([8 / math.tan(0.4)] * 3)
 
 
-def test_sizes_rates_and_times_can_be_set(views, tmp_path):
+def test_sizes_rates_and_times_can_be_set(trained, views, tmp_path):
     path = str(write(tmp_path / "a.json", nerfstudio(views)))
     written, changed = VideoOptions(path=path), VideoOptions(path=path, size=10, fps=9, time="0.5")
-    assert (written.shape({"train": views}), written.rate) == ((12, 20), 4)
-    assert (changed.shape({"train": views}), changed.rate) == ((6, 10), 9)
-    assert written.times({"train": views}).tolist() == [0.75, 0.25]
-    assert changed.times({"train": views}).tolist() == [0.5, 0.5]
+    for options, size, rate, seen_at in (
+        (written, (12, 20), 4, [0.75, 0.25]),
+        (changed, (6, 10), 9, [0.5, 0.5]),
+    ):
+        track = options.track(trained.scene, trained.frame)
+        assert {(camera.height, camera.width) for camera in track.cameras} == {size}
+        assert (track.times.tolist(), options.rate) == (seen_at, rate)
 
 
 def test_times_of_a_spline_that_overshoots_stay_in_range(views, tmp_path, caplog):

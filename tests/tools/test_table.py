@@ -350,18 +350,16 @@ def test_published_figures_stand_beside_equal_resolutions_and_all_views_alone(tm
     assert [f[1] for f in found if f[0] == "data.views=10 model.resolution=128"] == [""]
 
 
-def named(folder: Path, *tables: str, early: bool = False) -> None:
-    """Make a folder a sweep that names published tables, as one of early 0.3 does or of today."""
-    today = {"hydra": {"callbacks": {"table": {"published": list(tables)}}}}
-    content = {"hydra": {}, "published": list(tables)} if early else today
+def named(folder: Path, *tables: str) -> None:
+    """Make a folder a sweep that names published tables."""
+    content = {"hydra": {"callbacks": {"table": {"published": list(tables)}}}}
     (folder / "multirun.yaml").write_text(yaml.safe_dump(content))
 
 
-@pytest.mark.parametrize("early", [False, True])
-def test_a_named_table_is_shown_whole_whatever_the_data(tmp_path, early):
+def test_a_named_table_is_shown_whole_whatever_the_data(tmp_path):
     make(tmp_path / "a", model="kplanes")
     assert "published" not in write_tables(tmp_path)
-    named(tmp_path, "Table 1", early=early)
+    named(tmp_path, "Table 1")
     text = write_tables(tmp_path)
     rows = [entry for entry in read_published() if entry["table"] == "Table 1"]
     assert len(rows) == 8

@@ -83,13 +83,18 @@ class Client:
         return [len(image) for image in self.shown]
 
 
+def in_field(trained: TrainedRun, index: int) -> Tensor:
+    """The pose of a training camera in the field's frame."""
+    pose = trained.scene.splits["train"].camera_to_world[index].clone()
+    pose[:3, :3] = trained.frame.rotation @ pose[:3, :3]
+    pose[:3, 3] = trained.frame.points(pose[:3, 3])
+    return pose
+
+
 @pytest.fixture
 def client(trained: TrainedRun, viewer: Viewer) -> Client:
     """A browser at a training camera."""
-    pose = trained.scene.splits["train"].camera_to_world[0].clone()
-    pose[:3, :3] = trained.frame.rotation @ pose[:3, :3]
-    pose[:3, 3] = trained.frame.points(pose[:3, 3])
-    found = Client(pose)
+    found = Client(in_field(trained, 0))
     viewer.size.value = "64"
     viewer._connect(found)
     return found
@@ -106,6 +111,17 @@ def test_cameras_come_back_as_ours(trained):
     for pose in orbit_poses(trained.views, trained.frame, 5, elevation=35):
         back = camera_pose(torch.tensor(rotation(pose)), pose[:3, 3])
         assert torch.allclose(back, pose, atol=1e-5)
+
+
+def test_frusta_stand_where_training_cameras_are(trained, viewer):
+    views = trained.scene.splits["train"]
+    assert len(viewer.frusta) == len(views)
+    for index, frustum in enumerate(viewer.frusta):
+        pose = camera_pose(torch.from_numpy(frustum.wxyz), torch.from_numpy(frustum.position))
+        assert torch.allclose(pose, in_field(trained, index), atol=1e-5)
+        assert (frustum.fov, frustum.aspect) == (pytest.approx(views.intrinsics.fov_y), 1)
+    shades = [sum(viewer.frusta[int(i)].color) for i in views.times.argsort()[[0, -1]]]
+    assert shades[0] < shades[1]
 
 
 def test_pictures_are_small_while_something_changes_and_full_at_rest(viewer, client, monkeypatch):
@@ -162,7 +178,7 @@ def test_controls_change_the_picture(viewer, client):
     assert client.depths[-1] is not None
     viewer.cameras.value = False
     picture()
-    assert not viewer.frusta.visible
+    assert not any(frustum.visible for frustum in viewer.frusta)
     assert client.depths[-1] is None
 
 

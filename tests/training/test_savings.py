@@ -27,7 +27,7 @@ def test_a_saving_costs_less_than_its_bound(scenes, tmp_path):
     run(config, tmp_path / "run", [], resume=False)
     first, last = scores(tmp_path / "run")
     assert last > first + 8
-    trained = load_run(tmp_path / "run", device="cpu")
+    trained = load_run(tmp_path / "run")
     field, views, white = trained.module.field, trained.views, torch.ones(3)
     rays = trained.frame.rays(*views.image_rays(0))
     times = torch.full((len(rays[0]),), float(views.times[0]))

@@ -17,7 +17,7 @@ from xplanes import RadianceModule, SceneDataModule
 from xplanes.backend import waves
 from xplanes.baselines.proposal import spaced, unspaced
 from xplanes.evaluation import render
-from xplanes.evaluation.render import FRAMES, RunVideo, write_run_video
+from xplanes.evaluation.render import FRAMES, run_track, write_run_video
 from xplanes.rendering.behind import background_colour
 from xplanes.scenes.views import Scene
 from xplanes.training.building import loss_terms
@@ -317,15 +317,15 @@ def test_samples_of_contracted_space_are_even_in_distance_then_in_its_inverse():
 def test_the_video_of_a_world_is_seen_from_where_cameras_were(tmp_path):
     for kind in ("world", "alpha"):
         module = built(kind)
-        video = RunVideo.of(scene(kind), module.frame)
-        poses = torch.stack([camera.camera_to_world for camera in video.cameras])
+        track = run_track(scene(kind), module.frame)
+        poses = torch.stack([camera.camera_to_world for camera in track.cameras])
         own = scene(kind).splits["train"].camera_to_world
         nearest = torch.cdist(poses.flatten(1), own.flatten(1)).amin(dim=1)
-        assert bool((nearest < 1e-6).all()) == bool(video.path) == (kind == "world")
-        assert video.pixels == len(video.cameras) * 48**2
+        assert bool((nearest < 1e-6).all()) == bool(track.shown) == (kind == "world")
+        assert {(camera.height, camera.width) for camera in track.cameras} == {(48, 48)}
         path = write_run_video(module, scene(kind), tmp_path / kind)
         with Image.open(path) as frames:
-            shown = 2 * len(video.cameras) - 2 if video.path else FRAMES
+            shown = 2 * len(track.cameras) - 2 if track.shown else FRAMES
             assert (frames.n_frames, frames.size) == (shown, (48, 48))  # type: ignore[attr-defined]
 
 

@@ -18,11 +18,8 @@ from xplanes.scenes.views import Scene, Views, spread
 GAP_SPACINGS, GAP_SPAN = 12.0, 0.05
 """Shortest gap in time that is reported: in median spacings, and as a share of the time span."""
 
-SHORT_SPAN = 0.2
-"""Least share of [0, 1] that times should cover; less suggests wrong scaling."""
-
-ASTRAY = 0.1
-"""Largest acceptable share of cameras that do not see the centre of the cube."""
+SHORT_SPAN = 0.2  # Least share of [0, 1] that times should cover; less suggests wrong scaling.
+ASTRAY = 0.1  # Largest acceptable share of cameras that do not see the centre of the cube.
 
 SMALL, LARGE = 0.03, 3.0
 """Range of plausible half sides of the cube, in units of the cameras' median distance."""
@@ -34,14 +31,9 @@ first, poses are probably wrong; below the second, they are probably right."""
 EVEN = 0.35
 """Least distance of nine in ten orbiting cameras from the point where axes meet, in medians."""
 
-PALE_STEPS = 16
-"""Colour difference, out of 255, below which two pixels count as equal."""
-
-HALO = 0.03
-"""Width of the soft edge around a silhouette, as a share of the image's longer side."""
-
-AT_START = 32
-"""Maximum number of images, evenly spread, that are checked at the start of a run."""
+PALE_STEPS = 16  # Colour difference, out of 255, below which two pixels count as equal.
+HALO = 0.03  # Width of the soft edge around a silhouette, as a share of the image's longer side.
+AT_START = 32  # Maximum number of images, evenly spread, that are checked at the start of a run.
 
 
 @dataclass(frozen=True)
@@ -66,12 +58,7 @@ def stray_pixels(alpha: Tensor) -> int:
 
 
 def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
-    """Problems of cameras and times, and views that two splits share.
-
-    Args:
-        scene: The scene, with its training views and those that are scored.
-        frame: The field's frame; None if none could be estimated.
-    """
+    """Problems of cameras and times, and views that two splits share."""
     train = scene.splits["train"]
     yield from _times(scene, train)
     yield from shared(scene)
@@ -84,7 +71,7 @@ def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
 
 
 def scene_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
-    """Problems that a run warns about before training; arguments as for `camera_findings`."""
+    """Problems that a run warns about before training."""
     yield from camera_findings(scene, frame)
     yield from opaque_findings(scene)
     views = scene.splits["train"]

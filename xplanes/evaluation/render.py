@@ -1,6 +1,6 @@
 """Videos along a path of cameras and times."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -23,8 +23,7 @@ from xplanes.scenes.views import Scene, Views
 if TYPE_CHECKING:
     from xplanes.training.module import RadianceModule
 
-ELEVATION = 20.0
-"""Elevation of the orbiting camera, in degrees."""
+ELEVATION = 20.0  # Elevation of the orbiting camera, in degrees.
 
 
 def orbit_poses(views: Views, frame: Frame, count: int, elevation: float = ELEVATION) -> Tensor:
@@ -33,35 +32,65 @@ def orbit_poses(views: Views, frame: Frame, count: int, elevation: float = ELEVA
     return orbit(count, radius=float(distance), elevation=elevation, target=frame.centre)
 
 
+@dataclass(frozen=True)
+class Track:
+    """Cameras and times of a video.
+
+    Attributes:
+        cameras: The camera of each frame, in the world.
+        times: Time of each frame, from 0 to 1. [F]
+        shown: For each frame the pixels that have a ray through the lens, all if None; the others
+            are left empty. None for cameras that are no views. bool [rows, columns] each
+    """
+
+    cameras: list[PosedCamera]
+    times: Tensor
+    shown: list[Tensor | None] | None = None
+
+    @classmethod
+    def orbit(
+        cls,
+        views: Views,
+        frame: Frame,
+        times: Tensor,
+        size: tuple[int, int],
+        elevation: float = ELEVATION,
+        *,
+        fixed: bool = False,
+    ) -> "Track":
+        """An orbit with the views' field of view, or its first camera; size: rows and columns."""
+        poses = orbit_poses(views, frame, 1 if fixed else len(times), elevation)
+        focal = views.intrinsics.focal_at(max(size))
+        return cls([PosedCamera(p, focal, *size) for p in poses.expand(len(times), 4, 4)], times)
+
+    @classmethod
+    def of_views(
+        cls, views: Views, indices: list[int], times: Tensor, size: tuple[int, int]
+    ) -> "Track":
+        """Cameras of views, which keep distortion and principal point, at another size."""
+        known = {index: pixels_with_rays(views, index, *size) for index in set(indices)}
+        cameras = [views.camera(index).resized(*size) for index in indices]
+        return cls(cameras, times, [known[index] for index in indices])
+
+
 def render_path(
     field: Any,
     renderer: Renderer,
     frame: Frame,
-    cameras: Iterable[PosedCamera],
-    times: Tensor,
+    track: Track,
     *,
     background: Tensor,
     what: str = "colour",
-    shown: Sequence[Tensor | None] | None = None,
 ) -> Iterator[Tensor]:
-    """Render frames along a path of cameras and times, one at a time.
+    """Render the frames of a video, one at a time.
 
-    Args:
-        field: A field that the renderer accepts.
-        renderer: The renderer.
-        frame: The field's frame.
-        cameras: The camera of each frame, in the world.
-        times: Time of each frame, from 0 to 1. [F]
-        background: Colour behind the scene. [3]
-        what: ``colour``, or ``depth`` as colours on the same scale in all frames.
-        shown: For each frame the pixels that have a ray through the lens, all if None; the others
-            are left empty. All of all frames when None. bool [rows, columns] each
+    ``what`` is ``colour``, or ``depth`` as colours on the same scale in all frames.
 
     Yields:
         Pictures. uint8 [rows, columns, 3]
     """
-    masks = [None] * len(times) if shown is None else shown
-    for camera, time, mask in zip(cameras, times.tolist(), masks, strict=True):
+    masks = track.shown or [None] * len(track.cameras)
+    for camera, time, mask in zip(track.cameras, track.times.tolist(), masks, strict=True):
         image = renderer.view(field, frame, camera, time, background)
         if mask is not None:
             leave_empty(image, ~mask, background)
@@ -83,11 +112,6 @@ def _depth(image: dict[str, Tensor], distance: float) -> Tensor:
 
 def check_video(path: Path, *, frames: int, folder: bool = False) -> None:
     """Refuse what `write_video` cannot write, before anything is rendered.
-
-    Args:
-        path: The video file, or the folder for its frames.
-        frames: Number of frames.
-        folder: Whether ``path`` is a folder for one PNG per frame.
 
     Raises:
         ConfigError: If the suffix is unknown, the folder is not empty, or ``path`` is one image
@@ -158,17 +182,10 @@ def _write_image(path: Path, frame: Tensor) -> None:
 IMAGES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 """Pillow's names of the formats for single frames."""
 
-FRAMES, FPS = 48, 16
-"""Number of frames of a run's video, and frames per second."""
-
-VIDEO_SIZE = 200
-"""Maximum side length in pixels of a run's video."""
-
-SHOWN = 0.5
-"""Share of the timesteps that a camera must show for a video to stay with it."""
-
-FEW_CAMERAS = 4
-"""Largest number of calibrations for which each is assumed to be a separate camera."""
+FRAMES, FPS = 48, 16  # Number of frames of a run's video, and frames per second.
+VIDEO_SIZE = 200  # Maximum side length in pixels of a run's video.
+SHOWN = 0.5  # Share of the timesteps that a camera must show for a video to stay with it.
+FEW_CAMERAS = 4  # Largest number of calibrations for which each is assumed to be a separate camera.
 
 
 def training_path(views: Views, count: int) -> tuple[list[int], Tensor]:
@@ -219,11 +236,7 @@ def _nearest_of_each_timestep(views: Views, order: Tensor) -> Tensor:
 
 
 def pixels_with_rays(views: Views, index: int, height: int, width: int) -> Tensor | None:
-    """Pixels of an image of another size for which a view's lens has rays; None for all.
-
-    Returns:
-        bool [height, width]
-    """
+    """Pixels of another size for which a view's lens has rays; None for all. [height, width]"""
     if (known := views.intrinsics.has_ray(index)) is None:
         return None
     size = height, width
@@ -236,37 +249,14 @@ def fitting(height: int, width: int, longest: int) -> tuple[int, int]:
     return max(1, round(height * scale)), max(1, round(width * scale))
 
 
-@dataclass(frozen=True)
-class RunVideo:
-    """The cameras and times of a run's video: an orbit, or a `training_path` and back.
-
-    Attributes:
-        cameras: Camera of each frame that is rendered.
-        times: Its time, from 0 to 1. [F]
-        path: Index of the training view of each camera; empty for an orbit.
-    """
-
-    cameras: list[PosedCamera]
-    times: Tensor
-    path: list[int]
-
-    @classmethod
-    def of(cls, scene: Scene, frame: Frame) -> "RunVideo":
-        """The video of a scene: an orbit of an object; with surroundings, a `training_path`."""
-        views = scene.splits["train"]
-        size = min(VIDEO_SIZE, 2 * max(views.height, views.width))
-        if not scene.is_surrounded:
-            focal, poses = views.intrinsics.focal_at(size), orbit_poses(views, frame, FRAMES)
-            cameras = [PosedCamera(pose, focal, size, size) for pose in poses]
-            return cls(cameras, back_and_forth(FRAMES), [])
-        path, times = training_path(views, min(FRAMES // 2, len(views)))
-        shape = fitting(*views.size(path[0]), size)
-        return cls([views.camera(index).resized(*shape) for index in path], times, path)
-
-    @property
-    def pixels(self) -> int:
-        """Number of pixels that are rendered."""
-        return sum(camera.height * camera.width for camera in self.cameras)
+def run_track(scene: Scene, frame: Frame) -> Track:
+    """A run's video: an orbit of an object; with surroundings, a `training_path`."""
+    views = scene.splits["train"]
+    size = min(VIDEO_SIZE, 2 * max(views.height, views.width))
+    if not scene.is_surrounded:
+        return Track.orbit(views, frame, back_and_forth(FRAMES), (size, size))
+    path, times = training_path(views, min(FRAMES // 2, len(views)))
+    return Track.of_views(views, path, times, fitting(*views.size(path[0]), size))
 
 
 def back_and_forth(count: int) -> Tensor:
@@ -275,15 +265,11 @@ def back_and_forth(count: int) -> Tensor:
 
 
 def write_run_video(module: "RadianceModule", scene: Scene, run: Path) -> Path:
-    """Write media/video.webp, see `RunVideo`."""
-    frame, views = module.frame, scene.splits["train"]
-    assert frame is not None
-    video = RunVideo.of(module.corrected_scene(scene), frame)
-    first = video.cameras[0]
-    shown = [pixels_with_rays(views, index, first.height, first.width) for index in video.path]
-    options = {"background": scene.background, "shown": shown or None}
-    path = video.cameras, video.times
-    frames = list(render_path(module.field, module.renderer, frame, *path, **options))
-    if video.path:
+    """Write media/video.webp: a `run_track`, which goes back to its start if it is no orbit."""
+    assert module.frame is not None
+    track = run_track(module.corrected_scene(scene), module.frame)
+    parts = module.field, module.renderer, module.frame, track
+    frames = list(render_path(*parts, background=scene.background))
+    if track.shown is not None:
         frames += frames[-2:0:-1]
     return write_video(run / "media" / "video.webp", frames, fps=FPS)

@@ -14,7 +14,7 @@ from torch.utils.tensorboard.summary import hparams
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from xplanes import __version__, backend
-from xplanes.evaluation.render import RunVideo
+from xplanes.evaluation.render import run_track
 from xplanes.experiment import Experiment
 from xplanes.process import resume_command
 from xplanes.rendering.pictures import write_png
@@ -28,14 +28,9 @@ from xplanes.training.fit import Estimate, Trainer
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, blank_psnr, mean_colour, mean_scores
 
-LITTLE = 0.5
-"""Gain in dB over background-only images below which a run has learnt nothing."""
-
-LONG = 30.0
-"""Seconds of scores and images above which the header may say how to shorten them."""
-
-BUSY = 0.6
-"""CPU time per second of training on the CPU below which a run warns."""
+LITTLE = 0.5  # Gain in dB over background-only images below which a run has learnt nothing.
+LONG = 30.0  # Seconds of scores and images above which the header may say how to shorten them.
+BUSY = 0.6  # CPU time per second of training on the CPU below which a run warns.
 
 CLUTTERED = 0.2
 """Share of floaters above which a run warns; successful scenes have less than a tenth."""
@@ -53,15 +48,7 @@ def header(
 ) -> str:
     """The lines printed before training: software, data, model, budget and expected time.
 
-    Args:
-        experiment: The settings.
-        run: The run directory.
-        data: The data.
-        module: The module, with its field.
-        overrides: Overrides from the command line.
-        expected: Expected durations.
-        spent: Seconds since the start of this process's part of the run.
-        checkpoint: The checkpoint from which training continues, if any.
+    ``spent`` are seconds since this process began; training continues from ``checkpoint``, if any.
     """
     assert module.frame is not None
     assert module.initialisation is not None
@@ -116,14 +103,7 @@ def estimated(
 ) -> str:
     """The run's expected duration as text, ``spent`` seconds after its start.
 
-    Args:
-        experiment: The settings.
-        data: The data.
-        module: The module, with its field.
-        expected: Expected durations.
-        spent: Seconds so far.
-        done: Steps before a resume.
-        trained: Seconds of training before it.
+    Before a resume it had ``done`` steps in ``trained`` seconds of training.
     """
     trainer = experiment.trainer
     steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
@@ -146,7 +126,8 @@ def estimated(
         images += final.height * final.width * len(final) * expected.ray(whole)
     if experiment.media:
         assert module.frame is not None
-        images += RunVideo.of(data.scene, module.frame).pixels * expected.ray(whole)
+        cameras = run_track(data.scene, module.frame).cameras
+        images += sum(each.height * each.width for each in cameras) * expected.ray(whole)
     parts = f"{spent:.0f} s so far, {{}} of training, {images:.0f} s of scores and images"
     if train == math.inf:
         return parts.format("no end")
@@ -229,13 +210,7 @@ def rest(seconds: dict[str, Any], total: float) -> dict[str, float]:
 
 
 def write_pictures(trainer: Trainer, pictures: Mapping[str, Tensor], *, log: bool) -> None:
-    """Write images of the preparation to the run's media and, if wanted, to the loggers.
-
-    Args:
-        trainer: The Trainer, with run directory and loggers.
-        pictures: By name, colours from 0 to 1. [H, W, 3] each
-        log: Whether to pass them to the loggers, too.
-    """
+    """Write images of the preparation [H, W, 3] to the run's media and, if wanted, the loggers."""
     for name, picture in pictures.items():
         write_png(Path(trainer.default_root_dir) / "media" / f"{name}.png", picture)
         if log:

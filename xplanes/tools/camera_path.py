@@ -17,8 +17,7 @@ from xplanes.scenes.views import Views
 
 logger = logging.getLogger(__name__)
 
-OVERSHOOT = 0.25
-"""Tolerance of times beyond 0 and 1: splines through key frames overshoot."""
+OVERSHOOT = 0.25  # Tolerance of times beyond 0 and 1: splines through key frames overshoot.
 
 
 @dataclass(frozen=True)
@@ -61,10 +60,8 @@ def read_camera_path(path: Path) -> CameraPath:
     optionally ``time``; ``camera_angle_x`` (horizontal, in radians), once or in each frame;
     optionally ``w``, ``h`` and ``fps``.
 
-    If the file has no times, they run from 0 to 1 over the path.
-
-    Args:
-        path: The file. Poses are in the run's world coordinates, with OpenGL's axes.
+    Poses are in the run's world coordinates, with OpenGL's axes. If the file has no times, they run
+    from 0 to 1 over the path.
 
     Raises:
         SceneError: If the file is missing or damaged, or an entry is missing or out of range.
@@ -127,8 +124,7 @@ def path_contents(views: Views, fps: int) -> dict[str, dict[str, Any]]:
     }
 
 
-Entries = dict[str, Mapping[str, Any]]
-"""Cameras of a path by their names in messages."""
+Entries = dict[str, Mapping[str, Any]]  # Cameras of a path by their names in messages.
 
 
 def _entries(path: Path, content: Mapping[str, Any], key: str) -> Entries:

@@ -112,15 +112,7 @@ def _render(options: argparse.Namespace) -> None:
 
     wanted = _filled(VideoOptions, options)
     wanted.check()
-    trained = _load(options)
-    wanted = wanted.chosen_for(trained.scene)
-    height, width = wanted.shape(trained.scene.splits)
-    written = "as in the file" if wanted.cameras is not None else "back-and-forth"
-    written = "their own" if wanted.path == "cameras" else written
-    name = "training cameras" if wanted.path == "cameras" else f"{wanted.path} camera"
-    camera = f"{name}, time {wanted.time or written}"
-    say(f"frames      {wanted.count} of {width}x{height} px, {options.what}, {camera}\n")
-    say(f"wrote {render_video(trained, wanted)}")
+    say(f"wrote {render_video(_load(options), wanted)}")
 
 
 def _view(options: argparse.Namespace) -> None:

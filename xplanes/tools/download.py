@@ -35,12 +35,8 @@ class _BrokenTransferError(Exception):
 def fetch(url: str, path: Path) -> None:
     """Download ``url`` to ``path``; an incomplete download is kept in ``path``.part.
 
-    Another call resumes an interrupted download, if the server still has the same file (compared by
-    ETag or modification time) and supports range requests.
-
-    Args:
-        url: Address, http or https.
-        path: The file, which is written atomically.
+    Another call resumes an interrupted download if the server supports range requests. It does not
+    check whether the file has changed on the server meanwhile: the caller checks the content.
 
     Raises:
         FetchError: The server cannot be reached or refuses, or the disk is too full.
@@ -54,23 +50,23 @@ def fetch(url: str, path: Path) -> None:
         except _BrokenTransferError as problem:
             unreachable = attempt == 0 and isinstance(problem.__cause__, URLError)
             if unreachable or attempt == ATTEMPTS - 1:
-                kept = f" {_size(part)} MB are kept in {part}." if part.exists() else ""
+                kept = ""
+                if part.exists():
+                    kept = f" {part.stat().st_size / 1e6:.1f} MB are kept in {part}."
                 raise FetchError(f"{problem}.{kept}") from problem
             say(f"{problem}; trying again")
             time.sleep(PAUSE_SECONDS)
         else:
             part.replace(path)
-            _note_path(part).unlink(missing_ok=True)
             return
 
 
 def _advance(url: str, part: Path) -> None:
     """Download the rest of ``part``, or all of it if it cannot be resumed."""
-    validator = _saved_validator(url, part)
-    start = part.stat().st_size if validator else 0
+    start = part.stat().st_size if part.exists() else 0
     headers = {"User-Agent": "xplanes", "Accept-Encoding": "identity"}
-    if start and validator:
-        headers |= {"Range": f"bytes={start}-", "If-Range": validator}
+    if start:
+        headers["Range"] = f"bytes={start}-"
     try:
         response = urlopen(Request(url, headers=headers), timeout=TIMEOUT_SECONDS)
     except HTTPError as problem:
@@ -78,33 +74,25 @@ def _advance(url: str, part: Path) -> None:
             if start and problem.code == 416:
                 if problem.headers.get("Content-Range", "").endswith(f"*/{start}"):
                     return
-                _discard(part)
+                part.unlink()
                 raise _BrokenTransferError(f"{url} has changed since the download began") from None
             raise FetchError(f"{url} answered {problem.code} {problem.reason}.") from problem
     except (OSError, HTTPException) as problem:
         raise _BrokenTransferError(f"{url} cannot be reached ({problem})") from problem
     with response:
         if response.status == 206:
-            begins = response.headers.get("Content-Range", "").startswith(f"bytes {start}-")
-            if not begins or _validator(response) not in (None, validator):
-                _discard(part)
-                raise _BrokenTransferError(f"{url} has changed since the download began")
-            say(f"Continuing {url} after {_size(part)} MB")
+            say(f"Continuing {url} after {start / 1e6:.1f} MB")
+        elif response.headers.get_content_type() == "text/html":  # ``part`` is kept.
+            raise FetchError(f"{url} answered with a web page instead of a file.")
         else:
-            if response.headers.get_content_type() == "text/html":  # ``part`` is kept.
-                raise FetchError(f"{url} answered with a web page instead of a file.")
             start = 0
-            # Delete the old part first, so that it is never paired with the new identifier.
-            _discard(part)
-            note = {"url": url, "validator": _validator(response)}
-            _note_path(part).write_text(json.dumps(note), encoding="utf-8")
         _receive(url, response, part, start)
 
 
 def _receive(url: str, response: HTTPResponse, part: Path, start: int) -> None:
     total = None if response.length is None else start + response.length
     if total is not None:
-        check_space(part.parent, int(SPACE * total) - start)
+        _check_space(part.parent, int(SPACE * total) - start)
     received, reported = start, time.monotonic()
     with part.open("ab" if start else "wb") as file:
         while True:
@@ -129,50 +117,14 @@ def _receive(url: str, response: HTTPResponse, part: Path, start: int) -> None:
         )
 
 
-def check_space(folder: Path, needed: int) -> None:
-    """Check the free space of a disk.
-
-    Raises:
-        FetchError: Fewer than ``needed`` bytes are free on the disk of ``folder``.
-    """
+def _check_space(folder: Path, needed: int) -> None:
+    """Raise `FetchError` if fewer than ``needed`` bytes are free on the disk of ``folder``."""
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise FetchError(
             f"{folder} needs {needed / 1e6:.0f} MB of free space and has {free / 1e6:.0f} MB. "
             f"Make room or choose a folder on another disk."
         )
-
-
-def _validator(response: HTTPResponse) -> str | None:
-    """Identifier of this version of the file: a strong ETag, else the modification time."""
-    tag = response.headers.get("ETag")
-    if tag and not tag.startswith("W/"):
-        return tag
-    return response.headers.get("Last-Modified")
-
-
-def _saved_validator(url: str, part: Path) -> str | None:
-    """Identifier of the version of the file in ``part``; None if unknown."""
-    if not part.exists():
-        return None
-    try:
-        note = json.loads(_note_path(part).read_text(encoding="utf-8"))
-        return note["validator"] if note["url"] == url else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-def _discard(part: Path) -> None:
-    part.unlink(missing_ok=True)
-    _note_path(part).unlink(missing_ok=True)
-
-
-def _note_path(part: Path) -> Path:
-    return part.with_name(f"{part.name}.json")
-
-
-def _size(path: Path) -> str:
-    return f"{path.stat().st_size / 1e6:.1f}"
 
 
 # From the README of github.com/albertpumarola/D-NeRF; dl=1 requests the file itself.
@@ -200,10 +152,6 @@ def download_dnerf(root: Path, *, url: str = DNERF_URL) -> Path:
 
     The next call resumes an interrupted download. Existing scenes are not changed. An archive that
     was downloaded manually is used if it is in ``root`` as dnerf.zip.
-
-    Args:
-        root: Folder for one folder per scene; created if missing.
-        url: Address of the archive.
 
     Returns:
         The folder of the scenes, which is the value for data.root.
@@ -283,7 +231,7 @@ def _unpack(archive: Path, workspace: Path, names: list[str]) -> None:
                 if target is not None and target.parts[0] in names:
                     member.filename = str(target)
                     wanted.append(member)
-            check_space(archive.parent, sum(member.file_size for member in wanted))
+            _check_space(archive.parent, sum(member.file_size for member in wanted))
             source.extractall(workspace, wanted)  # Verifies CRCs.
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as problem:
         raise _BadArchiveError(f"it is damaged or no zip file ({problem})") from problem

@@ -20,11 +20,7 @@ from xplanes.training.scores import VISIBLE
 
 MODES = ("colour", "depth", "opacity", "floaters")
 
-NEAREST = 4
-"""Number of training images, nearest in time, whose silhouettes identify floaters."""
-
-MOST_CAMERAS = 100
-"""Most training cameras that are drawn."""
+NEAREST = 4  # Number of training images, nearest in time, whose silhouettes identify floaters.
 
 SLACK = 0.02
 """Margin around silhouettes, in the field's frame, within which nothing counts as a floater."""
@@ -34,7 +30,7 @@ RED = (0.9, 0.1, 0.1)
 
 @dataclass(frozen=True)
 class Shot:
-    """Camera, time and mode of a picture.
+    """Camera, time and mode, one of `MODES`, of a picture.
 
     Attributes:
         pose: Camera-to-world matrix, in the field's frame. [4, 4]
@@ -42,7 +38,6 @@ class Shot:
         fov: Vertical field of view, in radians.
         height: Rows.
         aspect: Columns per row.
-        mode: One of `MODES`.
         box: Least and largest corner of the crop, in the field's frame; None for all. [2, 3]
     """
 
@@ -91,20 +86,9 @@ def draw(
     at_once: int = 8192,
     stop: Callable[[], bool] = lambda: False,
 ) -> Picture | None:
-    """Render a picture.
+    """Render a picture; None once ``stop`` returns true, which is asked every ``at_once`` rays.
 
-    Args:
-        field: The field.
-        renderer: The renderer.
-        shot: Camera, time and mode.
-        views: Training views, whose silhouettes identify floaters.
-        frame: The field's frame.
-        background: Background colour. [3]
-        at_once: Rays per call of ``stop``, with a `RayRenderer`.
-        stop: Function that returns whether to abandon the picture.
-
-    Returns:
-        The picture on the CPU; None once ``stop`` returns true.
+    The silhouettes of the training views identify floaters. The picture is on the CPU.
     """
     device, box = renderer.device, shot.box
     field = snapshot(field, shot.time)
@@ -122,9 +106,8 @@ def draw(
     moved = shift(renderer, shot.pose[:3, 3], views, frame)
     at_once = at_once if isinstance(renderer, RayRenderer) else len(origins)
     parts: list[Tensor] = []
-    for rays in zip(
-        (origins + moved * directions).split(at_once), directions.split(at_once), strict=True
-    ):
+    origins = origins + moved * directions
+    for rays in zip(origins.split(at_once), directions.split(at_once), strict=True):
         if stop():
             return None
         given = rays[0].to(device), rays[1].to(device), shot, background
@@ -166,13 +149,8 @@ def shift(renderer: Renderer, position: Tensor, views: Views, frame: Frame) -> f
     """Distance by which to move ray origins for a renderer with near and far bounds.
 
     The bounds fit cameras as far from the scene as the training cameras; at other distances they
-    would cut the scene off. Origins are moved backwards by at most the near bound.
-
-    Args:
-        renderer: The renderer; its ``near``, in the field's frame, is used if it has one.
-        position: Position of the camera, in the field's frame. [3]
-        views: Training views.
-        frame: The field's frame.
+    would cut the scene off. Origins are moved backwards by at most the near bound. The position of
+    the camera [3] is in the field's frame.
     """
     near = getattr(renderer, "near", None)
     if near is None:
@@ -182,12 +160,7 @@ def shift(renderer: Renderer, position: Tensor, views: Views, frame: Frame) -> f
 
 
 def mark(colours: Tensor, share: Tensor) -> Tensor:
-    """A pale grey picture with visible floaters in red.
-
-    Args:
-        colours: The picture. [H, W, 3]
-        share: Opacity of the floaters. [H, W]
-    """
+    """A pale grey picture [H, W, 3] with visible floaters, by their opacity [H, W], in red."""
     grey = (0.4 + 0.6 * colours.mean(dim=-1, keepdim=True)).expand_as(colours)
     strength = torch.where(share > VISIBLE, 0.5 + 0.5 * share, 0)[..., None]
     return torch.lerp(grey, colours.new_tensor(RED).expand_as(colours), strength)
@@ -215,33 +188,3 @@ def ruled_out(views: Views, frame: Frame, time: float) -> Callable[[Tensor], Ten
         return ~held.to(points.device)
 
     return found
-
-
-def camera_outlines(views: Views, frame: Frame, length: float) -> tuple[Tensor, Tensor]:
-    """Frusta of training cameras as lines; with distortion their borders are curved.
-
-    Args:
-        views: Training views; at most `MOST_CAMERAS` of them, evenly spaced, are drawn.
-        frame: The field's frame.
-        length: Distance from a camera's centre to its image's corners, in the field's frame.
-
-    Returns:
-        Ends of line segments in the field's frame [L, 2, 3], and the time of each [L].
-    """
-    lines, times = [], []
-    for index in spread(MOST_CAMERAS, len(views)):
-        height, width = views.size(index)
-        steps = 1 if views.intrinsics.lens(index) is None else 8
-        share = torch.arange(steps) / steps
-        # Along the top, down the right side, back along the bottom, and up the left side.
-        there, back, none, all_ = share, 1 - share, torch.zeros(steps), torch.ones(steps)
-        columns = torch.cat([there, all_, back, none]) * width - 0.5
-        rows = torch.cat([none, there, all_, back]) * height - 0.5
-        number = torch.full_like(rows, index, dtype=torch.long)
-        origins, directions = frame.rays(*views.pixel_rays(number, rows, columns))
-        border = origins + length * directions
-        around = torch.stack([border, border.roll(-1, dims=0)], dim=1)
-        corners = torch.stack([origins, border], dim=1)[::steps]
-        lines += [around, corners]
-        times.append(views.times[index].expand(len(around) + len(corners)))
-    return torch.cat(lines), torch.cat(times)

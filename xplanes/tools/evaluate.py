@@ -19,26 +19,18 @@ from xplanes.training.scores import score_view
 logger = logging.getLogger(__name__)
 
 DEFAULT_NETWORK = "vgg"
-WEIGHTS = {
-    "vgg": ("VGG16_Weights", "528 MB"),
-    "alex": ("AlexNet_Weights", "233 MB"),
-}
+WEIGHTS = {"vgg": ("VGG16_Weights", "528 MB"), "alex": ("AlexNet_Weights", "233 MB")}
 """Name in torchvision and download size of the weights of each LPIPS backbone."""
 
 SMALLEST = 32
 """Least pixels per side for which the networks have feature maps."""
 
-Metric = Callable[[Tensor, Tensor], float]
-"""Distance of a prediction from the ground truth, both in [0, 1]. [H, W, 3], [H, W, 3]"""
-
 
 def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
     """Compute scores of all views of the run's split, with the same code as in training.
 
-    Args:
-        trained: The run.
-        network: Backbone of LPIPS, ``vgg`` or ``alex``, downloaded if necessary; ``none`` for no
-            LPIPS; None for vgg if it is already downloaded.
+    The backbone of LPIPS is ``vgg`` or ``alex``, downloaded if necessary; ``none`` for no LPIPS;
+    None for vgg if it is already downloaded.
 
     Returns:
         Content for `write_scores`: scores with the keys of metrics.json, and ``not_computed``, a
@@ -109,14 +101,13 @@ class UnavailableError(Exception):
     """LPIPS cannot be computed; the message is the reason."""
 
 
-def lpips(network: str, side: int, device: str, *, download: bool) -> Metric:
-    """The LPIPS distance; lower is better.
+def lpips(
+    network: str, side: int, device: str, *, download: bool
+) -> Callable[[Tensor, Tensor], float]:
+    """The LPIPS distance by ``vgg`` or ``alex``, whose values are not comparable; lower is better.
 
-    Args:
-        network: ``vgg`` or ``alex``; their values are not comparable.
-        side: Pixels of the shorter side of the images.
-        device: Device to compute on.
-        download: Whether to download the backbone's weights if they are missing.
+    It is that of a prediction from the ground truth, both in [0, 1] [H, W, 3], with ``side`` pixels
+    on the shorter side.
 
     Raises:
         UnavailableError: If a package, the weights or the images' size rule it out.

@@ -28,22 +28,14 @@ from xplanes.tools.runs import TrainedRun
 
 KINDS = ("mesh", "points", "planes", "path", "web")
 """Values of ``--what`` for any field; a field can add others with its `exports`."""
-FORMATS = ("ply", "glb")
 
 TIMES, WEB_TIMES = 10, 24
 """Default number of timesteps of a dynamic scene, for files and for a web page."""
 
-POINTS = 100_000
-"""Default number of points of a point cloud."""
-
-PAGE = "index.html"
-"""File name of a web page."""
-
-COARSEST = 8
-"""Least grid points along each side of the cube."""
-
-LARGEST = 1024
-"""Most grid points along each side of the cube; this many take 4 GB."""
+POINTS = 100_000  # Default number of points of a point cloud.
+PAGE = "index.html"  # File name of a web page.
+COARSEST = 8  # Least grid points along each side of the cube.
+LARGEST = 1024  # Most grid points along each side of the cube; this many take 4 GB.
 
 CAMERAS, RAYS, SAMPLES = 8, 4096, 256
 """Training cameras, rays per camera and samples per ray for the comparison of silhouettes."""
@@ -51,9 +43,8 @@ CAMERAS, RAYS, SAMPLES = 8, 4096, 256
 THINNEST, DENSEST, CANDIDATES = 1e-3, 5.0, 96
 """Smallest and largest threshold, as optical depths of a grid cell, and number of candidates."""
 
-PLATEAU = 0.001
-"""Intersections over union that differ by less count as equal."""
-
+PLATEAU = 0.001  # Intersections over union that differ by less count as equal.
+EXACT = "_EXACT"  # Name under which trimesh writes linear colours in single precision.
 
 Z_UP_TO_Y_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 """Rotation from coordinates with z up, which xplanes uses, to y up."""
@@ -61,18 +52,9 @@ Z_UP_TO_Y_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Options of `xplanes export`.
+    """Options of `xplanes export`, which its help explains.
 
-    Attributes:
-        what: ``mesh``, ``points``, ``planes``, ``path``, ``web``, or a name in the field's
-            `exports`.
-        times: A number of times spread evenly from 0 to 1, or times separated by commas; None for
-            10 times, 24 for a web page, or 1 for a static scene.
-        resolution: Grid points along each side of the field's cube.
-        threshold: Density of the surface, per unit length of the field's frame; None for the
-            result of `find_threshold`.
-        count: Points of a point cloud; None for 100,000, or for a mesh in a web page.
-        form: File format of meshes and point clouds: ``ply`` or ``glb``.
+    The threshold is a density per unit length of the field's frame.
     """
 
     what: str = "mesh"
@@ -89,8 +71,6 @@ class ExportOptions:
             ConfigError: If an option is invalid; the message says what is allowed.
             MissingExtraError: For meshes and points without the extra ``export``.
         """
-        if self.form not in FORMATS:
-            raise ConfigError(f"--format {self.form}: must be {' or '.join(FORMATS)}")
         require_between("--resolution", self.resolution, COARSEST, LARGEST)
         require_between("--points", self.count, 1, 10**8)
         if self.threshold is not None and not 0 < self.threshold < math.inf:
@@ -120,11 +100,7 @@ def _mesh_tools() -> tuple[Any, Any]:
 
 
 def export_times(text: str) -> list[float]:
-    """Times from "5" (evenly spread from 0 to 1) or "0,0.25,1" (a list).
-
-    Raises:
-        ConfigError: If it is neither.
-    """
+    """Times from "5" (evenly spread from 0 to 1) or "0,0.25,1" (a list); else a `ConfigError`."""
     try:
         if text.isdecimal() and 1 <= int(text) <= 100_000:
             return torch.linspace(0, 1, int(text)).tolist()
@@ -143,13 +119,8 @@ def export_times(text: str) -> list[float]:
 def export(trained: TrainedRun, options: ExportOptions, out: Path | None = None) -> Path:
     """Export a run for other programs, and list the files in ``export.json``.
 
-    Args:
-        trained: The run.
-        options: Content and format of the export.
-        out: Folder to write into, empty or new; ``export/WHAT`` in the run directory when None.
-
-    Returns:
-        The folder.
+    The folder ``out``, empty or new, is ``export/WHAT`` in the run directory when None; it is
+    returned.
 
     Raises:
         ConfigError: If options are out of range, do not fit the run, or the field shows nothing.
@@ -166,7 +137,7 @@ def export(trained: TrainedRun, options: ExportOptions, out: Path | None = None)
     facts: dict[str, Any] = {"what": options.what, "run": str(trained.path)}
     facts |= {"checkpoint": trained.checkpoint, "step": trained.step}
     if options.what in ("planes", "path"):
-        write = write_planes if options.what == "planes" else write_paths
+        write = _write_planes if options.what == "planes" else _write_paths
         facts["files"] = write(folder, trained)
     else:
         if getattr(field, "background", None) is not None:
@@ -197,7 +168,7 @@ def _write_times(
     shown = tqdm(times, "times", leave=False, delay=2, disable=None)
     try:
         for time, path in zip(shown, files, strict=True):
-            shape = shape_at(trained, time, options.resolution, threshold, count)
+            shape = _shape_at(trained, time, options.resolution, threshold, count)
             _write_shape(path, shape)
     except ConfigError:
         for path in files:  # Another threshold can then be tried with the same folder.
@@ -221,7 +192,7 @@ def _threshold(trained: TrainedRun, options: ExportOptions, times: list[float]) 
     else:
         _mesh_tools()
         if not isinstance(field, SurfaceField):
-            return threshold or find_threshold(trained, options.resolution, times[len(times) // 2])
+            return threshold or _find_threshold(trained, options.resolution, times[len(times) // 2])
         own = "a surface of its own"
     if threshold is not None:
         raise ConfigError(
@@ -230,22 +201,11 @@ def _threshold(trained: TrainedRun, options: ExportOptions, times: list[float]) 
     return None
 
 
-def shape_at(
+def _shape_at(
     trained: TrainedRun, time: float, resolution: int, threshold: float | None, count: int | None
 ) -> Shape:
-    """The coloured surface of one timestep, in world coordinates.
-
-    Args:
-        trained: The run.
-        time: From 0 to 1.
-        resolution: Grid points along each side of the field's cube.
-        threshold: Density of the surface; None for a field of signed distances.
-        count: Number of points to sample on the surface; None for triangles.
-
-    Raises:
-        ConfigError: If there is no surface.
-    """
-    mesh = surface(trained, time, resolution, threshold)
+    """The coloured surface of one timestep in the world: ``count`` points, or all triangles."""
+    mesh = _surface(trained, time, resolution, threshold)
     if count is None:
         places, normals = mesh.vertices, mesh.vertex_normals
     else:
@@ -255,7 +215,7 @@ def shape_at(
     outward = torch.tensor(normals, dtype=torch.float32)
     # The visible colour of a soft surface comes from slightly below it.
     depth = 0 if threshold is None else 2 / resolution
-    colours = surface_colours(trained, points - depth * outward, outward, time)
+    colours = _surface_colours(trained, points - depth * outward, outward, time)
     return Shape(trained.frame.to_world(points), colours, mesh.faces if count is None else None)
 
 
@@ -295,9 +255,9 @@ def _write_web(
             kept = int(share * min(len(points), options.count or len(points)))
             return Shape(trained.frame.to_world(points[:kept].cpu()), colours[:kept].cpu())
         if options.count is None:
-            return shape_at(trained, time, coarser(share), threshold, None)
+            return _shape_at(trained, time, coarser(share), threshold, None)
         count = max(1, int(share * options.count))
-        return shape_at(trained, time, options.resolution, threshold, count)
+        return _shape_at(trained, time, options.resolution, threshold, count)
 
     written = write_page(
         folder / PAGE,
@@ -317,10 +277,6 @@ def _write_web(
     fitted = "" if share == 1 else f"; reduced to {share:.0%} to stay below 20 MB"
     say(f"page        {len(times)} timesteps, {shown}{fitted}; {written['bytes'] / 1e6:.1f} MB")
     return facts
-
-
-EXACT = "_EXACT"
-"""Name under which trimesh writes linear colours in single precision."""
 
 
 def _glb(geometry: Any) -> bytes:
@@ -352,8 +308,8 @@ def _linear(colours: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def surface(trained: TrainedRun, time: float, resolution: int, threshold: float | None) -> Any:
-    """The surface of one timestep, by marching cubes.
+def _surface(trained: TrainedRun, time: float, resolution: int, threshold: float | None) -> Any:
+    """The closed ``trimesh.Trimesh`` of one timestep in the field's frame, by marching cubes.
 
     Args:
         trained: The run.
@@ -362,17 +318,23 @@ def surface(trained: TrainedRun, time: float, resolution: int, threshold: float 
         threshold: Density of the surface; None for a field of signed distances, whose surface is
             their zero level set.
 
-    Returns:
-        A closed ``trimesh.Trimesh`` in the field's frame, without colours.
-
     Raises:
         ConfigError: If there is no surface.
     """
     measure, trimesh = _mesh_tools()
-    volume, empty = solidity(trained, time, resolution)
+    volume, empty = _solidity(trained, time, resolution)
     level = 0.0 if threshold is None else -math.expm1(-threshold * 2 / resolution)
-    if not float(volume.max()) > level:
-        raise ConfigError(_nothing(time, volume, threshold))
+    largest = float(volume.max())
+    if not largest > level:
+        if threshold is None:
+            raise ConfigError(
+                f"at time {time:g} the field has no surface in its cube: train longer"
+            )
+        most = -math.log1p(-largest) * resolution / 2 if largest < 1 else math.inf
+        raise ConfigError(
+            f"at time {time:g} the field's density is nowhere above the threshold "
+            f"{threshold:.4g}; the largest is {most:.4g}: set --threshold to less"
+        )
     # Padding with empty values closes the surface where it meets the cube.
     padded = F.pad(volume, [1] * 6, value=empty).numpy()
     # Faces are counter-clockwise when seen from the side with smaller values.
@@ -382,33 +344,16 @@ def surface(trained: TrainedRun, time: float, resolution: int, threshold: float 
     return trimesh.Trimesh((vertices - 0.5) * (2 / resolution) - 1, faces, process=False)
 
 
-def _nothing(time: float, volume: Tensor, threshold: float | None) -> str:
-    if threshold is None:
-        return f"at time {time:g} the field has no surface in its cube: train longer"
-    largest = float(volume.max())
-    most = -math.log1p(-largest) * len(volume) / 2 if largest < 1 else math.inf
-    return (
-        f"at time {time:g} the field's density is nowhere above the threshold {threshold:.4g}; the "
-        f"largest is {most:.4g}: set --threshold to less"
-    )
-
-
 @torch.no_grad()
-def solidity(trained: TrainedRun, time: float, resolution: int) -> tuple[Tensor, float]:
+def _solidity(trained: TrainedRun, time: float, resolution: int) -> tuple[Tensor, float]:
     """Sample the field at the centres of a grid's cells, as opacity or as depth below its surface.
 
     Opacity of one cell is used instead of density: density varies widely inside solid objects, so
     it interpolates badly. A field of signed distances gives the depth below the surface, clamped
     to a cell on either side. Points in empty cells of the occupancy grid are not evaluated.
 
-    Args:
-        trained: The run.
-        time: From 0 to 1.
-        resolution: Grid points along each side of the field's cube.
-
     Returns:
-        Values on the CPU [resolution, resolution, resolution], axes x, y, z; and the value of
-        empty space.
+        Values on the CPU, axes x, y, z [resolution] * 3; and the value of empty space.
     """
     field, renderer = trained.module.field, trained.module.renderer
     device, cell = renderer.device, 2 / resolution
@@ -444,25 +389,17 @@ def _looked_at(trained: TrainedRun, points: Tensor, time: float) -> Tensor:
 
 
 @torch.no_grad()
-def find_threshold(trained: TrainedRun, resolution: int, time: float) -> float:
+def _find_threshold(trained: TrainedRun, resolution: int, time: float) -> float:
     """The density threshold whose surface matches the field's silhouettes best.
 
     Silhouettes are those of training cameras. A pixel is in the field's silhouette if its opacity
     is at least 0.5, and in the surface's if its ray passes a density above the threshold. The
     threshold maximises the intersection over union of the two.
 
-    Args:
-        trained: The run.
-        resolution: Grid points along each side of the field's cube.
-        time: From 0 to 1.
-
-    Returns:
-        Density per unit length of the field's frame.
-
     Raises:
         ConfigError: If no pixel has an opacity of 0.5.
     """
-    volume = solidity(trained, time, resolution)[0]
+    volume = _solidity(trained, time, resolution)[0]
     views, renderer = trained.scene.splits["train"], trained.module.renderer
     assert isinstance(renderer, RayRenderer)
     shown, peaks = [], []
@@ -505,18 +442,8 @@ def _peaks(volume: Tensor, origins: Tensor, directions: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def surface_colours(trained: TrainedRun, points: Tensor, normals: Tensor, time: float) -> Tensor:
-    """Colours of points on or below a surface, viewed against their normals.
-
-    Args:
-        trained: The run.
-        points: In the field's frame. [N, 3]
-        normals: Unit normals that point outwards. [N, 3]
-        time: From 0 to 1.
-
-    Returns:
-        From 0 to 1, on the CPU. [N, 3]
-    """
+def _surface_colours(trained: TrainedRun, points: Tensor, normals: Tensor, time: float) -> Tensor:
+    """Colours on the CPU of points of the field's frame, against outward normals. [N, 3] each"""
     field, device = trained.module.field, trained.module.renderer.device
     colours = []
     for part, normal in zip(points.split(2**15), normals.split(2**15), strict=True):
@@ -532,27 +459,16 @@ def surface_colours(trained: TrainedRun, points: Tensor, normals: Tensor, time: 
     return torch.cat(colours)
 
 
-def write_paths(folder: Path, trained: TrainedRun) -> list[str]:
-    """Write the training cameras in the order of their times as camera paths.
-
-    Returns:
-        The files' names: ``camera_path.json``, in nerfstudio's format, and ``transforms.json``.
-    """
+def _write_paths(folder: Path, trained: TrainedRun) -> list[str]:
+    """Write the training cameras in the order of their times; return the files' names."""
     contents = path_contents(trained.scene.splits["train"], FPS)
     for name, content in contents.items():
         write_json(folder / name, content)
     return list(contents)
 
 
-def write_planes(folder: Path, trained: TrainedRun) -> list[str]:
-    """Write an X-Planes field as safetensors; docs/recipes.md describes the layout.
-
-    Returns:
-        The files' names.
-
-    Raises:
-        ConfigError: If the run's field is not an `XPlanes`.
-    """
+def _write_planes(folder: Path, trained: TrainedRun) -> list[str]:
+    """Write an X-Planes field as docs/recipes.md describes it; return the file's name."""
     field, renderer, frame = trained.module.field, trained.module.renderer, trained.frame
     if type(field) is not XPlanes:  # A derived field may have more than planes and a decoder.
         raise ConfigError(

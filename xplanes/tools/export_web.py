@@ -20,17 +20,13 @@ from xplanes.files import write_text
 PARTS = Path(__file__).parent / "web"
 """Folder of the page's template, three.js, and its version and licence."""
 
-LIMIT = 20_000_000
-"""Largest size of a page in bytes, which mail and most hosts accept."""
+LIMIT = 20_000_000  # Largest size of a page in bytes, which mail and most hosts accept.
 
 COARSEST = 1 / 100
 """Share of the requested triangles or points below which there are too many timesteps."""
 
-SPARE = 100_000
-"""Bytes reserved for everything except the shapes, the template and three.js."""
-
-STEPS = 2**16 - 1
-"""Largest quantised coordinate along each side of a shape's bounding box."""
+SPARE = 100_000  # Bytes reserved for everything except the shapes, the template and three.js.
+STEPS = 2**16 - 1  # Largest quantised coordinate along each side of a shape's bounding box.
 
 
 @dataclass(frozen=True)
@@ -154,10 +150,7 @@ def _packed_shape(shape: Shape) -> dict[str, Any]:
 
 
 def packed(values: np.ndarray) -> bytes:
-    """Arrange unsigned integers as bytes that compress well; the page has the inverse.
-
-    Args:
-        values: Little-endian. [N, C]
+    """Arrange little-endian integers [N, C] as bytes that compress well; the page has the inverse.
 
     Returns:
         Differences between rows, modulo the type's range, column by column; each column has all

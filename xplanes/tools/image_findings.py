@@ -23,26 +23,13 @@ from xplanes.rendering.box import ray_box
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene, Views, spread
 
-COARSE = 8.0
-"""Image pixels per texel above which planes lose much of the images' detail."""
-
-CUT = 0.02
-"""Share of the foreground outside of the cube above which a warning is given."""
-
-PALE = 0.15
-"""Share of the silhouettes with the background's colour above which a warning is given."""
-
-EMPTY = 1e-3
-"""Share of opaque pixels below which an image is almost empty."""
-
-FULL = 0.98
-"""Share of opaque pixels above which a mask hides almost nothing."""
-
-MOST_VIEWS = 300
-"""Most images that are read per split, evenly spaced."""
-
-MOST_RAYS = 4096
-"""Most foreground pixels of an image whose rays are tested against the cube."""
+COARSE = 8.0  # Image pixels per texel above which planes lose much of the images' detail.
+CUT = 0.02  # Share of the foreground outside of the cube above which a warning is given.
+PALE = 0.15  # Share of the silhouettes with the background's colour above which a warning is given.
+EMPTY = 1e-3  # Share of opaque pixels below which an image is almost empty.
+FULL = 0.98  # Share of opaque pixels above which a mask hides almost nothing.
+MOST_VIEWS = 300  # Most images that are read per split, evenly spaced.
+MOST_RAYS = 4096  # Most foreground pixels of an image whose rays are tested against the cube.
 
 
 @dataclass(frozen=True)
@@ -74,15 +61,8 @@ class ImageFacts:
 
 
 def image_facts(views: Views, background: Tensor, frame: Frame | None) -> list[ImageFacts]:
-    """Statistics of the pixels of at most `MOST_VIEWS` images of a split.
-
-    Args:
-        views: The views of the split.
-        background: Background colour, from 0 to 1. [3]
-        frame: The field's frame; None if the cameras see no common volume.
-    """
-    chosen = spread(MOST_VIEWS, len(views))
-    return [_facts_of(views, index, background, frame) for index in chosen]
+    """Statistics of the pixels of at most `MOST_VIEWS` images; colours are from 0 to 1."""
+    return [_facts_of(views, i, background, frame) for i in spread(MOST_VIEWS, len(views))]
 
 
 def _facts_of(views: Views, index: int, background: Tensor, frame: Frame | None) -> ImageFacts:
@@ -156,13 +136,9 @@ def image_findings(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iter
 def texel_findings(
     per_texel: float, wide: int, resolution: int, *, fine: bool
 ) -> Iterator[Finding]:
-    """Warn if the images have far more detail than the planes can represent.
+    """Warn if training images have far more detail than the planes can represent.
 
-    Args:
-        per_texel: Pixels of the images in training per texel of the planes.
-        wide: Width of these images.
-        resolution: Texels along an axis of the planes.
-        fine: Whether the model can have additional finer planes (``model.fine``).
+    ``fine``: the model can have additional finer planes (``model.fine``).
     """
     if per_texel > COARSE:
         width = max(1, round(wide * 0.5 * COARSE / per_texel))

@@ -35,26 +35,20 @@ from xplanes.tools.tabulate import markdown
 CONSEQUENCES = {"axes": ("cut",), "scale": ("cut", "texels"), "astray": ("cut",)}
 """Findings that are consequences of another one, and not shown with it."""
 
-ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".xz", ".7z", ".rar")
-"""Endings of archives."""
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".xz", ".7z", ".rar")  # Endings of archives.
 
 STAMPED = "; programs write it for static scenes as well: data.static=true if nothing moves"
 """What is said of times from "timestamp"."""
 
-NATIVE = "data.resolution=null"
-"""The setting that reads images at their native size."""
+NATIVE = "data.resolution=null"  # The setting that reads images at their native size.
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The settings with which a capture is read.
+    """The settings with which a capture is read; ``overrides`` of train.py read the same.
 
-    Attributes:
-        overrides: Settings of train.py that read the same capture.
-        scene: The settings of the scene.
-        model: The settings of the model, for the field's frame and the resolution of its planes.
-        usual_width: Width of the images in the format's YAML file, if the native size is read by
-            default instead; None otherwise.
+    The usual width is that of the images in the format's YAML file, if the native size is read by
+    default instead; None otherwise.
     """
 
     overrides: tuple[str, ...]
@@ -70,8 +64,8 @@ class Capture:
     Attributes:
         choice: The settings with which it was read.
         scene: The scene.
-        frame: The field's frame; None if it cannot be determined.
-        problem: Why the frame cannot be determined; empty if it can.
+        frame: The field's frame; None if it cannot be determined, for the reason in ``problem``.
+        problem: Empty if there is a frame.
         images: Statistics of the pixels of each split's images.
         findings: Possible problems.
         texels: Texels along an axis of the planes; None for fields without planes.
@@ -90,13 +84,7 @@ class Capture:
 
 @dataclass(frozen=True)
 class CameraGroup:
-    """The views of one physical camera, judged by poses and lenses.
-
-    Attributes:
-        name: Folder of the views if it distinguishes the cameras, else a number.
-        indices: Indices of the views.
-        fixed: Whether the camera is static.
-    """
+    """The views of one physical camera; its name is their folder if that distinguishes cameras."""
 
     name: str
     indices: list[int]
@@ -194,11 +182,7 @@ def _recognised(folder: Path, changed: Sequence[str]) -> tuple[Path, str]:
 
 
 def inspect(choice: Choice) -> Capture:
-    """Read a capture and check it.
-
-    Raises:
-        SceneError: If it cannot be used.
-    """
+    """Read a capture and check it; `SceneError` if it cannot be used."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         choice.scene.prepare()
@@ -462,11 +446,7 @@ def _width_of_training(choice: Choice, scene: Scene) -> int | None:
 
 
 def check_out(out: Path, settings: SceneSettings) -> None:
-    """Check the file of the picture.
-
-    Raises:
-        ConfigError: If it is no PNG, or is in the folder of the scene.
-    """
+    """Raise `ConfigError` if the file of the picture is no PNG, or is in the scene's folder."""
     if out.suffix.lower() != ".png":
         raise ConfigError(f"--out {out}: must end in .png")
     folder = settings.folder.resolve()

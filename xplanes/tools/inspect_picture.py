@@ -17,8 +17,7 @@ from xplanes.scenes.views import Views, spread
 from xplanes.tools.inspect import CameraGroup, Capture, cameras_of
 
 WIDTH, HEIGHT, MARGIN = 1600, 960, 24
-SCALE = 2
-"""Supersampling factor of the picture, for anti-aliased lines and letters."""
+SCALE = 2  # Supersampling factor of the picture, for anti-aliased lines and letters.
 
 INK, FAINT, PAPER, PANEL = "#1f2933", "#9aa5b1", "#ffffff", "#f5f7fa"
 SPLITS = {"train": "#2b6cb0", "val": "#d97706", "test": "#2f855a"}
@@ -26,8 +25,7 @@ OTHER, ASTRAY, CUBE, GAP = "#6b46c1", "#d64545", "#c026a3", "#f9d6d5"
 POINT = "#627d98"
 MOST_FRUSTA, MOST_RAYS, MOST_STRIPS, SAMPLES = 80, 3, 12, 6
 MOST_POINTS = 3000
-EDGE_POINTS = 48
-"""Points along an edge of the cube; distortion makes edges curved."""
+EDGE_POINTS = 48  # Points along an edge of the cube; distortion makes edges curved.
 
 Box = tuple[float, float, float, float]
 """Left, top, right and bottom, in pixels of the finished picture."""
@@ -35,9 +33,8 @@ Box = tuple[float, float, float, float]
 
 def write_picture(path: Path, capture: Capture) -> None:
     """Draw a capture to a PNG file, written atomically."""
-    picture = draw(capture)
     with replacing(path) as temporary:
-        picture.save(temporary, format="PNG")
+        draw(capture).save(temporary, format="PNG")
 
 
 def draw(capture: Capture) -> Image.Image:
@@ -54,7 +51,7 @@ def draw(capture: Capture) -> Image.Image:
     _times(sheet, (left, top, right, top + 300), capture)
     _coverage(sheet, (left, top + 324, right, top + side), capture)
     _samples(sheet, (MARGIN, top + side + MARGIN, right, HEIGHT - 12), capture)
-    return sheet.finished()
+    return sheet.image.reduce(SCALE)
 
 
 class _Sheet:
@@ -63,9 +60,6 @@ class _Sheet:
     def __init__(self, width: int, height: int) -> None:
         self.image = Image.new("RGB", (SCALE * width, SCALE * height), PAPER)
         self.pen = ImageDraw.Draw(self.image)
-
-    def finished(self) -> Image.Image:
-        return self.image.reduce(SCALE)
 
     def line(self, points: Sequence[tuple[float, float]], colour: str, width: float = 1.0) -> None:
         places = [(SCALE * x, SCALE * y) for x, y in points]
@@ -129,24 +123,6 @@ def _legend(sheet: _Sheet, capture: Capture) -> None:
         x += 17 + sheet.text((x + 17, 60), words, anchor="lm") + 26
 
 
-class _Plan:
-    """Orthographic projection of world points to a panel."""
-
-    def __init__(self, box: Box, axes: str, points: Tensor) -> None:
-        self.columns = ["xyz".index(name) for name in axes]
-        flat = points[:, self.columns].double()
-        low, high = flat.amin(dim=0), flat.amax(dim=0)
-        self.middle = 0.5 * (low + high)
-        self.span = max(float((high - low).max()), 1e-9)
-        left, top, right, bottom = box
-        self.per_unit = 0.88 * min(right - left, bottom - top) / self.span
-        self.x, self.y = 0.5 * (left + right), 0.5 * (top + bottom)
-
-    def __call__(self, points: Tensor) -> list[tuple[float, float]]:
-        flat = (points[..., self.columns].double() - self.middle) * self.per_unit
-        return [(self.x + x, self.y - y) for x, y in flat.tolist()]
-
-
 def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
     """Cameras with their frusta, points, the cube, and rays through the corners of some images.
 
@@ -157,16 +133,24 @@ def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
     frame, splits = capture.frame, capture.scene.splits
     places = torch.cat([views.camera_to_world[:, :3, 3] for views in splits.values()])
     points = places if frame is None else torch.cat([places, _cube_edges(frame).flatten(0, 1)])
-    plan = _Plan((12, 30, side - 12, side - 30), axes, points)
-    length = 0.07 * plan.span
+    columns = ["xyz".index(name) for name in axes]
+    low, high = points[:, columns].double().aminmax(dim=0)
+    span = max(float((high - low).max()), 1e-9)
+    per_unit = 0.88 * (side - 60) / span
+
+    def plan(points: Tensor) -> list[tuple[float, float]]:
+        """Orthographic projection of world points."""
+        flat = (points[:, columns].double() - 0.5 * (low + high)) * per_unit
+        return [(0.5 * side + x, 0.5 * side - y) for x, y in flat.tolist()]
+
     if (known := capture.scene.points) is not None:
         known = known[known.isfinite().all(dim=1)]
         for place in plan(known[:: -(-len(known) // MOST_POINTS) or 1]):
             if all(0 < value < side for value in place):
                 sheet.dot(place, 0.8, POINT)
     train = splits["train"]
-    for index in _middles(MOST_RAYS, len(train)):
-        reach = 0.5 * plan.span
+    for index in spread(MOST_RAYS, len(train)):
+        reach = 0.5 * span
         if frame is not None:
             place = train.camera_to_world[index, :3, 3]
             reach = float((place - frame.centre).norm()) + 0.5 / frame.scale
@@ -185,12 +169,12 @@ def _cameras(side: int, title: str, axes: str, capture: Capture) -> Image.Image:
             place = views.camera_to_world[index, :3, 3]
             sheet.dot(plan(place[None])[0], 2.2, colour)
             if index in chosen or not sees[index]:
-                ends = torch.cat([_corners(views, index, length), place[None]])
+                ends = torch.cat([_corners(views, index, 0.07 * span), place[None]])
                 # Around the image, and from each of its corners to the camera.
                 sheet.line(plan(ends[[0, 1, 2, 3, 0, 4, 1, 4, 2, 4, 3]]), colour, 0.9)
     sheet.text((12, 8), f"{title}: {axes[0]} to the right, {axes[1]} up", size=15)
-    step = 10.0 ** math.floor(math.log10(0.4 * plan.span))
-    wide = step * plan.per_unit
+    step = 10.0 ** math.floor(math.log10(0.4 * span))
+    wide = step * per_unit
     sheet.line([(14, side - 14), (14 + wide, side - 14)], INK, 2)
     words = f"{step:g} world unit{'' if step == 1 else 's'}"
     sheet.text((22 + wide, side - 14), words, anchor="lm", size=13)
@@ -310,12 +294,6 @@ def _chosen(capture: Capture) -> list[tuple[str, int]]:
         views = sorted(groups[place].indices, key=lambda index: float(train.times[index]))
         chosen.append(views[round(share * len(views) - 0.5)])
     return [*(("train", index) for index in dict.fromkeys(chosen)), *others]
-
-
-def _middles(count: int, total: int) -> list[int]:
-    """Indices of the middles of at most ``count`` equal parts of a sequence."""
-    count = min(count, total)
-    return [round((i + 0.5) * total / count - 0.5) for i in range(count)]
 
 
 def _sample(views: Views, index: int, size: tuple[int, int], frame: Frame | None) -> Image.Image:

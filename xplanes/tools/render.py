@@ -16,53 +16,35 @@ from xplanes.evaluation.render import (
     FPS,
     FRAMES,
     IMAGES,
+    Track,
     back_and_forth,
     check_video,
     fitting,
-    orbit_poses,
-    pixels_with_rays,
     render_path,
     training_path,
     write_video,
 )
 from xplanes.files import require_writable
+from xplanes.process import say
 from xplanes.scenes.cameras import PosedCamera
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.views import Scene, Views
 from xplanes.tools.camera_path import CameraPath, read_camera_path
 from xplanes.tools.runs import TrainedRun
 
-OWN = "own"
-"""Value of ``--time`` for the time of the view that ``--path`` names."""
+OWN = "own"  # Value of ``--time`` for the time of the view that ``--path`` names.
 
 PATHS = ("auto", "orbit", "fixed", "cameras")
 """Values of ``--path`` other than names of views or files."""
 
-LARGEST = 8192
-"""Most pixels per side; WebP allows twice as many."""
+LARGEST = 8192  # Most pixels per side; WebP allows twice as many.
 
 
 @dataclass(frozen=True)
 class VideoOptions:
-    """Options of `xplanes render`.
+    """Options of `xplanes render`, which its help explains.
 
-    Attributes:
-        path: Camera: ``orbit``, ``fixed`` (the first camera of the orbit), ``cameras`` (those of
-            the training views, see `training_path`), ``view:FILE``, a camera path, FILE.json, or
-            ``auto``, see `chosen_for`.
-        time: ``sweep`` (from 0 to 1), ``back-and-forth``, ``own`` (that of ``view:FILE``), or a
-            number from 0 to 1; None for ``own`` in a single image of a view, for the times of a
-            camera path or of ``cameras``, or for back-and-forth.
-        frames: Number of frames; None for 48, for 1 if a fixed camera or a view shows one time, or
-            for one per camera of a camera path.
-        fps: Frames per second; None for 16, or the rate in the camera path.
-        size: Pixels of the longer side; None for the size of the training views, of the view that
-            ``path`` names, or the size in the camera path. Frames of an orbit or a fixed camera
-            are square.
-        elevation: Elevation of orbit and fixed camera, in degrees.
-        what: ``colour`` or ``depth``.
-        out: A file (.webp, .mp4, .png, .jpg), or a folder if it ends in /; None for a file in the
-            run's media/ that is named after the options.
+    Without ``out``, the file is in the run's media/ and is named after the options.
     """
 
     path: str = "auto"
@@ -89,11 +71,7 @@ class VideoOptions:
 
     @cached_property
     def cameras(self) -> CameraPath | None:
-        """The camera path, read from its file; None if ``path`` is another kind of camera.
-
-        Raises:
-            SceneError: If it cannot be used.
-        """
+        """The camera path, read from its file; None if ``path`` is another kind of camera."""
         return read_camera_path(Path(self.path)) if self.path.endswith(".json") else None
 
     @property
@@ -113,48 +91,33 @@ class VideoOptions:
         written = None if self.cameras is None else self.cameras.fps
         return self.fps or written or FPS
 
-    def times(self, splits: dict[str, Views]) -> Tensor:
-        """Time of each frame, from 0 to 1, for a scene with these splits. [F]
-
-        Raises:
-            ConfigError: As `times` and `find_view`.
-        """
-        if self.cameras is not None and self.time is None:
-            return self.cameras.times
-        if self.path == "cameras" and self.time in (None, OWN):
-            return training_path(splits["train"], self.count)[1]
-        if self.time == OWN and (found := self.views(splits)) is not None:
-            views, indices = found
-            return views.times[indices]
-        return times(self.time or "back-and-forth", self.count)
-
-    def shape(self, splits: dict[str, Views]) -> tuple[int, int]:
-        """Rows and columns of a frame, for a scene with these splits.
-
-        Raises:
-            ConfigError: As `find_view`.
-        """
-        height = width = max(splits["train"].height, splits["train"].width)
-        if (found := self.views(splits)) is not None:
-            views, indices = found
-            height, width = views.size(indices[0])
-        elif self.cameras is not None:
-            height = self.cameras.height or self.cameras.width or height
-            width = self.cameras.width or height
-        return (height, width) if self.size is None else fitting(height, width, self.size)
-
-    def views(self, splits: dict[str, Views]) -> tuple[Views, list[int]] | None:
-        """The split and index of the view whose camera takes each frame; None for other cameras.
-
-        Raises:
-            ConfigError: As `find_view`.
-        """
+    def track(self, scene: Scene, frame: Frame) -> Track:
+        """Camera and time of each frame; `ConfigError` if there is no such view."""
+        views, count, time = scene.splits["train"], self.count, self.time
+        side = max(views.height, views.width)
+        if (path := self.cameras) is not None:
+            height = path.height or path.width or side
+            size = self._sized(height, path.width or height)
+            pairs = zip(path.poses, path.focal(*size).tolist(), strict=True)
+            seen_at = path.times if time is None else times(time, count)
+            return Track([PosedCamera(pose, focal, *size) for pose, focal in pairs], seen_at)
+        if self.path in ("orbit", "fixed"):
+            seen_at = times(time or "back-and-forth", count)
+            parts = views, frame, seen_at, self._sized(side, side), self.elevation
+            return Track.orbit(*parts, fixed=self.path == "fixed")
         if self.path == "cameras":
-            return splits["train"], training_path(splits["train"], self.count)[0]
-        if not self.path.startswith("view:"):
-            return None
-        views, index = find_view(splits, self.path.removeprefix("view:"))
-        return views, [index] * self.count
+            time = time or OWN
+            indices, seen_at = training_path(views, count)
+        else:
+            views, index = find_view(scene.splits, self.path.removeprefix("view:"))
+            indices = [index] * count
+            seen_at = views.times[indices]
+        if time != OWN:
+            seen_at = times(time or "back-and-forth", count)
+        return Track.of_views(views, indices, seen_at, self._sized(*views.size(indices[0])))
+
+    def _sized(self, height: int, width: int) -> tuple[int, int]:
+        return (height, width) if self.size is None else fitting(height, width, self.size)
 
     def destination(self, run: Path, checkpoint: str) -> tuple[Path, bool]:
         """The file or folder to write, and whether it is a folder."""
@@ -174,8 +137,7 @@ class VideoOptions:
         """Check the options without a run.
 
         Raises:
-            ConfigError: If an option is invalid; the message says what is allowed.
-            SceneError: If a camera path cannot be used.
+            ConfigError, SceneError: If an option is invalid, or a camera path cannot be used.
             ImportError: For .mp4 without the extra ``video``.
         """
         views = self.path.startswith("view:")
@@ -210,68 +172,34 @@ class VideoOptions:
 
 
 def render_video(trained: TrainedRun, options: VideoOptions) -> Path:
-    """Render and write a video.
-
-    Args:
-        trained: The run.
-        options: Cameras, times and size of the frames, and where to write them.
-
-    Returns:
-        The file or folder that was written.
-
-    Raises:
-        ConfigError: If options are out of range or contradict one another.
-        ImportError: For .mp4 without the extra ``video``.
-    """
+    """Render and write a video, and return its file or folder; fails as the options' check does."""
     options.check()
     options = options.chosen_for(trained.scene)
+    track = options.track(trained.scene, trained.frame)
+    name, written = f"{options.path} camera", "back-and-forth"
+    if options.path == "cameras":
+        name, written = "training cameras", "their own"
+    elif options.cameras is not None:
+        written = "as in the file"
+    camera = f"{name}, time {options.time or written}"
+    size = f"{track.cameras[0].width}x{track.cameras[0].height}"
+    say(f"frames      {options.count} of {size} px, {options.what}, {camera}\n")
     target, folder = options.destination(trained.path, trained.checkpoint)
     require_writable(target.parent)
-    splits = trained.scene.splits
-    shown = None
-    if (found := options.views(splits)) is not None:
-        shape = options.shape(splits)
-        views, indices = found
-        known = {index: pixels_with_rays(views, index, *shape) for index in set(indices)}
-        shown = [known[index] for index in indices]
     frames = render_path(
         trained.module.field,
         trained.module.renderer,
         trained.frame,
-        cameras(options, splits, trained.frame),
-        options.times(splits),
+        track,
         background=trained.scene.background,
         what=options.what,
-        shown=shown,
     )
     counted = tqdm(frames, "frames", options.count, leave=False, delay=2, disable=None)
     return write_video(target, counted, fps=options.rate, folder=folder)
 
 
-def cameras(options: VideoOptions, splits: dict[str, Views], frame: Frame) -> list[PosedCamera]:
-    """The camera of each frame.
-
-    A view's camera keeps its distortion and principal point. An orbit has the views' field of view.
-    """
-    rows, columns = options.shape(splits)
-    if (path := options.cameras) is not None:
-        focal = path.focal(rows, columns).tolist()
-        return [PosedCamera(p, f, rows, columns) for p, f in zip(path.poses, focal, strict=True)]
-    if (found := options.views(splits)) is not None:
-        views, indices = found
-        return [views.camera(index).resized(rows, columns) for index in indices]
-    views, count = splits["train"], options.count
-    poses = orbit_poses(views, frame, 1 if options.path == "fixed" else count, options.elevation)
-    focal = views.intrinsics.focal_at(max(rows, columns))
-    return [PosedCamera(pose, focal, rows, columns) for pose in poses.expand(count, 4, 4)]
-
-
 def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:
-    """Find a view by file name, with or without extension; returns its split and its index there.
-
-    Raises:
-        ConfigError: If there is no such view; the message lists similar names.
-    """
+    """Split and index of a view by file name, with or without extension; else a `ConfigError`."""
     known = {file: (v, index) for v in splits.values() for index, file in enumerate(v.files)}
     for file, found in known.items():
         if name in (file, file.rsplit(".", 1)[0]):
@@ -284,11 +212,7 @@ def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:
 
 
 def times(name: str, count: int) -> Tensor:
-    """Time of each frame, from 0 to 1. [F]
-
-    Raises:
-        ConfigError: If ``name`` is neither ``sweep``, ``back-and-forth`` nor a number from 0 to 1.
-    """
+    """Time of each frame: ``sweep``, ``back-and-forth`` or a number; else `ConfigError`. [F]"""
     if name == "sweep":
         return torch.linspace(0, 1, count)
     if name == "back-and-forth":

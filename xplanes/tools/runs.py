@@ -26,18 +26,10 @@ LISTED = 5
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """A run with its scene and trained field.
+    """A run with its scene and the field of its ``last`` or ``best`` checkpoint.
 
-    Attributes:
-        path: The run directory.
-        experiment: The settings.
-        scene: The scene, with the training views and one more split; poses that training has
-            corrected are corrected.
-        split: Name of the other split.
-        frame: The field's frame.
-        module: The trained module, in evaluation mode.
-        checkpoint: ``last`` or ``best``.
-        step: Step of the checkpoint.
+    The scene has the training views and those of ``split``; poses that training has corrected are
+    corrected. The module is in evaluation mode.
     """
 
     path: Path
@@ -55,12 +47,8 @@ class TrainedRun:
         return self.scene.splits[self.split]
 
 
-def find_run(path: Path, outputs: Path = OUTPUTS) -> Path:
-    """Check that ``path`` is a run directory.
-
-    Raises:
-        ConfigError: If it is not one; the message lists runs of similar names, or the newest.
-    """
+def find_run(path: Path) -> Path:
+    """The path, if it is a run directory; else a `ConfigError` lists similar or the newest runs."""
     if is_run(path):
         return path
     inside = find_runs(path) if path.is_dir() else []
@@ -68,10 +56,10 @@ def find_run(path: Path, outputs: Path = OUTPUTS) -> Path:
         names = _listed(inside[:LISTED])
         raise ConfigError(f"{path} is a folder of {len(inside)} runs; name one of them:{names}")
     problem = "is not a run directory" if path.exists() else "does not exist"
-    runs = {run.resolve(): run for folder in (outputs, path.parent) for run in find_runs(folder)}
+    runs = {run.resolve(): run for folder in (OUTPUTS, path.parent) for run in find_runs(folder)}
     if not runs:
         raise ConfigError(
-            f"{path} {problem}, and there are no runs in {outputs}: {train_command()}"
+            f"{path} {problem}, and there are no runs in {OUTPUTS}: {train_command()}"
         )
     names = difflib.get_close_matches(path.name, {run.name for run in runs}, n=LISTED)
     near = [run for name in names for run in runs.values() if run.name == name]
@@ -101,17 +89,15 @@ def load_run(
     *,
     checkpoint: str = "last",
     split: str | None = None,
-    device: str | None = None,
     plugins: Sequence[str] = (),
     announce: Callable[[str], None] | None = None,
 ) -> TrainedRun:
-    """Load a trained run from a checkpoint.
+    """Load a trained run from a checkpoint to the CPU, if it was trained there, or a GPU if found.
 
     Args:
         run: The run directory.
         checkpoint: ``last`` or ``best``.
         split: Split to read; None for the split of the run's final scores.
-        device: Device of the field; None to follow ``trainer.accelerator``.
         plugins: User modules with classes that the run's settings may name.
         announce: Receives messages about what is loaded.
 
@@ -120,10 +106,8 @@ def load_run(
     """
     experiment = read_experiment(run, plugins)
     data = replace(experiment.data, root=found_root(run, experiment.data.root))
-    if device is None:
-        # A run that was trained on a GPU may be loaded on a machine without one.
-        wanted = str(experiment.trainer.get("accelerator", "auto"))
-        device = str(find_device("cpu" if wanted == "cpu" else "auto"))
+    # A run that was trained on a GPU may be loaded on a machine without one.
+    device = find_device("cpu" if experiment.trainer.get("accelerator") == "cpu" else "auto")
     path = run / "checkpoints" / f"{checkpoint}.ckpt"
     state = load_checkpoint(path)
     step = state.get("global_step")
@@ -153,15 +137,7 @@ def load_run(
 
 
 def read_experiment(run: Path, plugins: Sequence[str] = ()) -> Experiment:
-    """The settings of a run directory.
-
-    Args:
-        run: The run directory.
-        plugins: User modules with classes that the settings may name.
-
-    Raises:
-        ConfigError: If they are missing, damaged, or from another version.
-    """
+    """The settings of a run, which may name classes of ``plugins``; `ConfigError` if unusable."""
     content, version = read_config(run), _record(run).get("xplanes")
     try:
         return Experiment.read(content, plugins)

@@ -23,14 +23,9 @@ WHAT = ("runs", "steps", "parts")
 """runs: a row per scene, a column per run. steps: a row per run, a column per step. parts: low-rank
 and sparse part of each run's triplanes."""
 
-LINE, GAP = 16, 4
-"""Height of a line of text and gap between tiles, in pixels."""
-
-FPS, HELD = 2, 4
-"""Frames per second of a video, and how many times its last frame is repeated."""
-
-Line = tuple[str, Sequence[Image.Image]]
-"""A row of tiles with its title."""
+LINE, GAP = 16, 4  # Height of a line of text and gap between tiles, in pixels.
+FPS, HELD = 2, 4  # Frames per second of a video, and how many times its last frame is repeated.
+Line = tuple[str, Sequence[Image.Image]]  # A row of tiles with its title.
 
 _STEP = re.compile(r"step(\d+)")
 _TWICE = re.compile(r"^(train|val|test)_(?=\1_)")
@@ -49,23 +44,12 @@ def write_sheet(
 ) -> Path:
     """Write a contact sheet of all runs in a folder.
 
-    With "runs", one seed per setting is shown, unless all runs differ only in their seed.
-
-    Args:
-        folder: A run, a sweep, or any folder of runs.
-        out: A PNG file, or with "steps" also a WebP video with a frame per step;
-            ``folder/sheet_WHAT.png`` when None.
-        what: One of `WHAT`.
-        show: Quantity to show, one of `xplanes.rendering.pictures.STRIP`.
-        view: Name of the view, as in ``media``, or a unique ending of it; None for the middle one
-            of those that all runs of a scene have.
-        steps: Steps to show; None for all, or with "runs" for the last.
-        size: Pixels of a tile's longer side.
+    With "runs", one seed per setting is shown, unless all runs differ only in their seed. The help
+    of `xplanes sheet` explains the options.
 
     Raises:
         ConfigError: If there are no runs, pictures, such view or step, or ``view`` is ambiguous.
     """
-    check_what(what)
     out = out or folder / f"sheet_{what}.png"
     if out.suffix not in ((".png", ".webp") if what == "steps" else (".png",)):
         raise ConfigError(
@@ -83,11 +67,12 @@ def write_sheet(
         lines = _parts(found, over)
     else:
         lines = _views(found, over, what, show, view, steps, size)
+    widest = max(tile.width for _, tiles in lines for tile in tiles)
     if out.suffix == ".webp":
-        frames = (torch.from_numpy(np.array(sheet)) for sheet in _video(lines))
-        return write_video(out, frames, fps=FPS)
+        frames = (_assemble(frame, widest) for frame in _frames(lines))
+        return write_video(out, (torch.from_numpy(np.array(f)) for f in frames), fps=FPS)
     with replacing(out) as temporary:
-        _assemble(lines, _widest(lines)).save(temporary, format="PNG", optimize=True)
+        _assemble(lines, widest).save(temporary, format="PNG", optimize=True)
     return out
 
 
@@ -99,11 +84,7 @@ def _one_seed(rows: list[RunRow]) -> list[RunRow]:
 
 
 def check_what(what: str | None) -> None:
-    """Check a kind of sheet.
-
-    Raises:
-        ConfigError: If it is neither None nor one of `WHAT`.
-    """
+    """Raise `ConfigError` if a kind of sheet is neither None nor one of `WHAT`."""
     if what is not None and what not in WHAT:
         raise ConfigError(
             f"hydra.callbacks.table.sheet={what}: must be null or one of {', '.join(WHAT)}"
@@ -230,16 +211,11 @@ def _score(strip: Image.Image) -> float:
     return psnr(prediction, truth)
 
 
-def _video(lines: Sequence[Line]) -> Iterator[Image.Image]:
-    """Frames with ground truth and one step each; runs with fewer steps repeat their last one."""
+def _frames(lines: Sequence[Line]) -> Iterator[list[Line]]:
+    """Ground truth and one step in each; runs with fewer steps repeat their last one."""
     last = max(len(tiles) for _, tiles in lines) - 1
     for step in [*range(1, last), *[last] * HELD]:
-        shown = [(title, [tiles[0], tiles[min(step, len(tiles) - 1)]]) for title, tiles in lines]
-        yield _assemble(shown, _widest(lines))
-
-
-def _widest(lines: Sequence[Line]) -> int:
-    return max(tile.width for _, tiles in lines for tile in tiles)
+        yield [(title, [tiles[0], tiles[min(step, len(tiles) - 1)]]) for title, tiles in lines]
 
 
 def _tile(picture: Image.Image, caption: str) -> Image.Image:

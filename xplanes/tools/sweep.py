@@ -20,6 +20,7 @@ from xplanes.config import key_and_value, without
 from xplanes.errors import ConfigError
 from xplanes.files import natural
 from xplanes.files import read_rows as read_csv
+from xplanes.readers.entries import is_number
 from xplanes.settings import flatten
 
 
@@ -98,11 +99,7 @@ class RunRow:
 
 
 def read_rows(folder: Path) -> list[RunRow]:
-    """All runs in a folder, at any depth, and the jobs of sweeps without a run directory.
-
-    Raises:
-        ConfigError: If the folder does not exist or contains no runs.
-    """
+    """All runs below a folder, and jobs without a run; `ConfigError` if there are none."""
     if not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder")
     rows, groups = [], list(_groups(folder))
@@ -234,11 +231,6 @@ def _scores(metrics: dict[str, Any]) -> dict[str, float]:
     return found
 
 
-def is_number(value: Any) -> bool:
-    """Whether a setting or score is a number; booleans are not."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def run_overrides(run: Path) -> list[str]:
     """Overrides of the command line, from overrides.txt or Hydra's record.
 
@@ -294,7 +286,6 @@ def published_tables(folder: Path) -> list[str]:
     for place, _ in _groups(folder):
         content = _mapping(place / "multirun.yaml", []) or {}
         with suppress(KeyError, TypeError):
-            # Early sweeps of version 0.3 have it at the top level.
-            own = content.get("published") or content["hydra"]["callbacks"]["table"]["published"]
+            own = content["hydra"]["callbacks"]["table"]["published"]
             found += [name for name in own if name not in found]
     return found

@@ -23,9 +23,10 @@ from xplanes.errors import ConfigError
 from xplanes.files import replacing, write_json, write_rows, write_text
 from xplanes.metrics import mean
 from xplanes.process import say
+from xplanes.readers.entries import is_number
 from xplanes.tools.published import beside, check_published
 from xplanes.tools.sheet import check_what, write_sheet
-from xplanes.tools.sweep import Point, RunRow, is_number, published_tables, read_rows
+from xplanes.tools.sweep import Point, RunRow, published_tables, read_rows
 from xplanes.tools.tabulate import (
     SCENE,
     SEED,
@@ -40,15 +41,10 @@ from xplanes.tools.tabulate import (
 
 
 def write_tables(folder: Path, out: Path | None = None) -> str:
-    """Tabulate all runs in a folder.
+    """Tabulate all runs in a folder; return the content of table.md.
 
-    Args:
-        folder: A sweep, or any folder of runs.
-        out: Output folder; ``folder`` when None. It gets table.md, table.csv, table_seeds.csv (if
-            there are several seeds), and with the extra ``plots`` curves.png and against.png.
-
-    Returns:
-        Content of table.md.
+    ``out``, by default the folder itself, gets table.md, table.csv, table_seeds.csv (if there are
+    several seeds), and with the extra ``plots`` curves.png and against.png.
 
     Raises:
         ConfigError: If there are no runs in the folder.
@@ -68,9 +64,10 @@ def write_tables(folder: Path, out: Path | None = None) -> str:
         text.append(published)
     if parts := decomposition_table(rows, names):
         text += ["Decomposition of the LRM's triplanes (means over xy, xz, yz):", shown(parts)]
-    if len(rows) > 1 and plot_curves(rows, names, out / "curves.png"):
+    plots = importlib.util.find_spec("matplotlib") is not None
+    if plots and len(rows) > 1 and plot_curves(rows, names, out / "curves.png"):
         text.append("![PSNR against seconds and steps](curves.png)")
-    if plot_against(rows, names, out / "against.png"):
+    if plots and plot_against(rows, names, out / "against.png"):
         text.append("![PSNR at the end](against.png)")
     whole = "\n\n".join(text) + "\n"
     write_text(out / "table.md", whole)
@@ -116,18 +113,14 @@ PLACES = 60
 
 
 def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
-    """Plot PSNR against seconds, preparation included, and against steps, a column per scene.
-
-    Returns:
-        Whether a plot was written: it needs curves and matplotlib (extra ``plots``).
-    """
+    """Plot PSNR against seconds and steps, a column per scene; false if there are no curves."""
     over = [name for name in names if name not in (SEED, SCENE)]
     lines: dict[tuple[str, str], list[tuple[Point, ...]]] = {}
     for row in rows:
         if len(row.curve) > 1:
             key = str(row.settings.get(SCENE, "")), run_label(row, over)
             lines.setdefault(key, []).append(row.curve)
-    if not lines or not importlib.util.find_spec("matplotlib"):
+    if not lines:
         return False
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter
@@ -158,10 +151,9 @@ def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> boo
 
 
 def plot_against(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
-    """Plot final PSNR, as mean over scenes and seeds, against a setting with at least three values.
+    """Plot final PSNR, as mean over scenes and seeds, against a setting of three values or more.
 
-    Returns:
-        Whether a plot was written: it needs exactly one such setting, and matplotlib.
+    False if there is not exactly one such setting.
     """
     done = [row for row in rows if "psnr" in row.scores]
     numeric = {}
@@ -171,7 +163,7 @@ def plot_against(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bo
             # null means all, so it is the last value of the axis.
             places = [math.inf if value is None else float(value) for value in values]
             numeric |= {name: places} if len(set(places)) > 2 else {}
-    if len(numeric) != 1 or not importlib.util.find_spec("matplotlib"):
+    if len(numeric) != 1:
         return False
     from matplotlib.figure import Figure
 
@@ -277,16 +269,10 @@ class SweepTable(Callback):
 
 
 def choose_gpu(job: int, environment: MutableMapping[str, str]) -> str | None:
-    """Choose a GPU for a parallel job: job number modulo number of GPUs.
+    """Set ``CUDA_VISIBLE_DEVICES`` to the GPU of a parallel job; None if there are fewer than two.
 
-    A process keeps the GPU of its first job, because CUDA reads ``CUDA_VISIBLE_DEVICES`` only once.
-
-    Args:
-        job: Number of the job within the sweep.
-        environment: Environment; its ``CUDA_VISIBLE_DEVICES`` is read, and set to the chosen GPU.
-
-    Returns:
-        The GPU; None if there are fewer than two.
+    It is job number modulo number of GPUs. A process keeps the GPU of its first job, because CUDA
+    reads the variable only once.
     """
     listed = environment.get("CUDA_VISIBLE_DEVICES")
     if listed is None:

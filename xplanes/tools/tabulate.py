@@ -12,14 +12,9 @@ SEED, SCENE = "seed", "data.scene"
 UNLISTED = ("resume", "callbacks.evaluation.at", "media", "trainer.log_every_n_steps")
 """Settings without influence on results."""
 
-SPREAD = ("psnr", "ssim", "psnr_foreground")
-"""Scores whose standard deviation over seeds is shown."""
-
-LONGEST = 120
-"""Most characters of a cell in markdown; the CSV is not shortened."""
-
-Line = dict[str, Any]
-"""A line of a table by column name: settings as text, scores as numbers."""
+SPREAD = ("psnr", "ssim", "psnr_foreground")  # Scores whose standard deviation over seeds is shown.
+LONGEST = 120  # Most characters of a cell in markdown; the CSV is not shortened.
+Line = dict[str, Any]  # A line of a table by column name: settings as text, scores as numbers.
 
 
 def differing(rows: Sequence[RunRow]) -> list[str]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from xplanes.errors import ConfigError, SceneError
-from xplanes.evaluation.render import render_path, write_video
+from xplanes.evaluation.render import Track, render_path, write_video
 from xplanes.experiment import Experiment
 from xplanes.fields import XPlanes
 from xplanes.fields.xplanes import SPACE_PLANES
@@ -32,15 +32,10 @@ SAMPLES, CELLS = 192, 64  # Steps along the diagonal; cells of the grid per side
 
 
 def write_triplanes(paths: Sequence[Path], out: Path, experiment: Experiment) -> Path:
-    """Encode images into triplanes; write them and a turntable video.
+    """Encode images, or folders of them, into triplanes; write them and a turntable video.
 
-    Args:
-        paths: Images, or folders of them.
-        out: File to write, .safetensors or .pt; the video has the same name with .webp.
-        experiment: Settings of the LRM, the cache and the device; others are ignored.
-
-    Returns:
-        The video file.
+    The video has the name of ``out``, .safetensors or .pt, with .webp, and is returned. Of the
+    settings only those of the LRM, the cache and the device are used.
 
     Raises:
         ConfigError, LRMError, SceneError: If a setting, the weights or an image cannot be used.
@@ -87,11 +82,7 @@ def write_triplanes(paths: Sequence[Path], out: Path, experiment: Experiment) ->
 
 
 def find_pictures(paths: Sequence[Path]) -> list[Path]:
-    """Image files; for a folder, all its images in natural order of their names.
-
-    Raises:
-        SceneError: If a path is missing, or there are no images.
-    """
+    """Image files, those of folders in natural order; `SceneError` if there are none."""
     found: list[Path] = []
     for path in paths:
         if path.is_dir():
@@ -109,12 +100,9 @@ def find_pictures(paths: Sequence[Path]) -> list[Path]:
 
 
 def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[Tensor]:
-    """Frames of a camera orbit that begins at the model's canonical camera.
+    """Frames of a camera orbit around triplanes [T, 3, C, H, H], one after another.
 
-    Args:
-        triplanes: One or more triplanes, shown one after another. [T, 3, C, H, H]
-        model: The LRM that produced them.
-        device: Device to render on.
+    It begins at the canonical camera of the LRM that produced them.
 
     Yields:
         Images with a white background. uint8 [SIDE, SIDE, 3]
@@ -138,6 +126,5 @@ def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[T
             azimuth = math.degrees(math.atan2(y, x)) + 360 * number / FRAMES
             pose = camera_around(azimuth, 0.0, view.distance).float()
             cameras.append(PosedCamera(pose, view.focal * SIDE, SIDE, SIDE))
-        path, white = (cameras, torch.zeros(len(cameras))), torch.ones(3)
-        renderer = GridRenderer(grid, SAMPLES)
-        yield from render_path(field, renderer, frame, *path, background=white)
+        track, white = Track(cameras, torch.zeros(len(cameras))), torch.ones(3)
+        yield from render_path(field, GridRenderer(grid, SAMPLES), frame, track, background=white)

@@ -17,29 +17,25 @@ from xplanes.errors import ConfigError
 from xplanes.evaluation.render import orbit_poses
 from xplanes.optional import require
 from xplanes.rendering.pictures import colour_map, to_bytes
-from xplanes.scenes.views import Scene
-from xplanes.tools.drawing import MODES, Picture, Shot, camera_outlines, draw
+from xplanes.scenes.views import Scene, spread
+from xplanes.tools.drawing import MODES, Picture, Shot, draw
 from xplanes.training.module import RadianceModule
 
 HOST, PORT = "127.0.0.1", 8080
 SIZES = ("64", "96", "128", "200", "320", "480", "720", "1080")
 SPEEDS = {"1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0, "4": 4.0}
-LOOP_SECONDS = 4.0
-"""Duration of one playback from time 0 to 1, at speed 1."""
+LOOP_SECONDS = 4.0  # Duration of one playback from time 0 to 1, at speed 1.
 TICK_SECONDS = 0.04
-SETTLE_SECONDS = 0.25
-"""Seconds without camera motion before the picture is rendered at full size."""
+SETTLE_SECONDS = 0.25  # Seconds without camera motion before the picture is rendered at full size.
 MOVING_SECONDS = 0.08
 """Rendering time of a picture, in seconds, while the camera moves or time plays."""
-FEWEST = 16
-"""Least number of rows of a picture."""
+FEWEST = 16  # Least number of rows of a picture.
 REFRESH_SECONDS, SHARE = 0.5, 3
 """A picture of a field in training is refreshed after this number of seconds, but not before this
 multiple of its rendering time."""
-AWAY = 1.4
-"""Initial camera distance from the scene, relative to that of the training cameras."""
-FRUSTUM = 0.1
-"""Length of the cameras' frusta, relative to their median distance from the scene."""
+AWAY = 1.4  # Initial camera distance from the scene, relative to that of the training cameras.
+FRUSTUM = 0.04  # Size of the cameras' frusta, relative to their median distance from the scene.
+MOST_CAMERAS = 100  # Most training cameras that are drawn.
 LARGEST_DEPTH = 160.0
 """Depth is clamped to this value, just below the largest that viser can encode."""
 GREY = (120, 120, 120)
@@ -57,12 +53,9 @@ def camera_pose(wxyz: Tensor, position: Tensor) -> Tensor:
 
 
 def check_address(host: str, port: int, *, key: str) -> None:
-    """Check that an address can be served.
+    """Check that an address can be served; port 0 is any free one.
 
-    Args:
-        host: Name or address of this machine.
-        port: From 0 to 65535; 0 for any free one.
-        key: Name of the settings in messages; ``host`` or ``port`` replaces the braces.
+    In ``key``, the settings' name in messages, ``host`` or ``port`` replaces the braces.
 
     Raises:
         ConfigError: If the port is taken or out of range, or the host is not this machine.
@@ -246,16 +239,32 @@ class Viewer:
         self.cameras.on_update(lambda _: self._show_cameras())
 
     def _add_cameras(self) -> None:
-        away = self.frame.points(self.views.camera_to_world[:, :3, 3]).norm(dim=-1).median()
-        lines, times = camera_outlines(self.views, self.frame, FRUSTUM * float(away))
-        colours = to_bytes(colour_map(times))[:, None].expand_as(lines)
-        scene = self.server.scene
-        style: Any = {"thickness": 1.5, "thickness_units": "screen"}
-        self.frusta = scene.add_line_segments("/cameras", lines.numpy(), colours.numpy(), **style)
+        views, scene = self.views, self.server.scene
+        lines: Any = {"thickness": 1.5, "thickness_units": "screen"}
+        places = self.frame.points(views.camera_to_world[:, :3, 3])
+        # To the field's frame, and from OpenGL to OpenCV axes.
+        turns = self.frame.rotation @ views.camera_to_world[:, :3, :3] * torch.tensor([1, -1, -1])
+        turns = require("viser.transforms", extra="viewer").SO3.from_matrix(turns.numpy()).wxyz
+        size, pinhole = views.intrinsics.size, views.intrinsics.pinhole
+        heights = 2 * (0.5 * size[:, 0] / pinhole[:, 1]).atan()
+        colours = to_bytes(colour_map(views.times)).numpy()
+        self.frusta = [
+            scene.add_camera_frustum(
+                f"/cameras/{index}",
+                fov=float(heights[index]),
+                aspect=float(size[index, 1] / size[index, 0]),
+                scale=FRUSTUM * float(places.norm(dim=-1).median()),
+                color=colours[index],
+                wxyz=turns[index],
+                position=places[index].numpy(),
+                **lines,
+            )
+            for index in spread(MOST_CAMERAS, len(views))
+        ]
         corners = torch.cartesian_prod(*3 * [torch.tensor([-0.5, 0.5])])
         pairs = torch.combinations(torch.arange(8))
         edges = corners[pairs[(corners[pairs].diff(dim=1)[:, 0] != 0).sum(dim=1) == 1]]
-        self.outline = scene.add_line_segments("/crop", edges.numpy(), GREY, visible=False, **style)
+        self.outline = scene.add_line_segments("/crop", edges.numpy(), GREY, visible=False, **lines)
 
     def _toggle_play(self) -> None:
         self.playing = not self.playing
@@ -289,7 +298,8 @@ class Viewer:
         self._refresh()
 
     def _show_cameras(self) -> None:
-        self.frusta.visible = self.cameras.value
+        for frustum in self.frusta:
+            frustum.visible = self.cameras.value
         self._refresh()
 
     def _refresh(self) -> None:
@@ -308,19 +318,12 @@ class Viewer:
 
 @dataclass
 class _Browser:
-    """State of one connected browser.
+    """State of one connected browser; ``client`` is viser's handle.
 
-    Attributes:
-        viewer: The viewer.
-        client: Viser's handle of the browser.
-        version: Number of changes of its camera and the controls.
-        changed: Time of the last change.
-        drawn: ``version`` of its last picture.
-        step: Training step of its last picture.
-        sharp: Whether its last picture has the full size.
-        began: Time at which rendering of its last picture began.
-        again: Earliest time of the next picture, if only the field has changed.
-        rate: Rendering speed in pixels per second.
+    ``version`` counts changes of its camera and the controls, the last of which was at ``changed``.
+    Its last picture is of version ``drawn`` and training step ``step``, was ``began`` then, and is
+    ``sharp`` if it has the full size. If only the field changes, the next one waits until
+    ``again``. The rate is in pixels per second.
     """
 
     viewer: Viewer

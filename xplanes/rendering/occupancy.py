@@ -62,7 +62,6 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("density", torch.full((cells,), 4 * self.empty_density))
         self.register_buffer("least", torch.zeros(cells))
         self.register_buffer("occupied", torch.ones(cells, dtype=torch.bool))
-        self.register_load_state_dict_pre_hook(_without_kept)
 
     def bins(self, times: Tensor) -> Tensor:
         """Time bin of each time from 0 to 1. int64 [N]"""
@@ -300,8 +299,3 @@ class OccupancyGrid(nn.Module):
         index = [cells % size, cells // size % size, cells // size**2 % size, cells // size**3]
         place = torch.stack(index, dim=-1) + uniform
         return place[:, :3] * (2 / size) - 1, place[:, 3] / self.time_bins
-
-
-def _without_kept(grid: OccupancyGrid, state: dict[str, Tensor], prefix: str, *_: object) -> None:
-    """Load older checkpoints, which lack ``kept``, without changing it."""
-    state.setdefault(f"{prefix}kept", grid.kept)

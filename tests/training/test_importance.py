@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.balls import ball_scene
-from tests.training.runs import gone_on, same_state, small_config
+from tests.training.runs import also, gone_on, same_state, small_config
 from xplanes.scenes import importance
 from xplanes.training import module
 from xplanes.training.module import RadianceModule
@@ -16,16 +16,14 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, bool]]:
     monkeypatch.setattr(module, "START", 3)
     monkeypatch.setattr(importance, "REFRESH", 3)
     drawn: list[tuple[int, bool]] = []
-    step = RadianceModule.training_step
 
-    def noted(self: RadianceModule, batch, batch_idx):
-        drawn.append((self.batches, "weight" in batch))
+    def noted(module: RadianceModule, batch, _):
+        drawn.append((module.batches, "weight" in batch))
         if "weight" in batch:
             assert len(batch["weight"]) == len(batch["times"])
             assert float(batch["weight"].mean()) == pytest.approx(1, abs=0.3)
-        return step(self, batch, batch_idx)
 
-    monkeypatch.setattr(RadianceModule, "training_step", noted)
+    also(monkeypatch, RadianceModule, "training_step", noted, first=True)
     return drawn
 
 

@@ -54,7 +54,7 @@ OPACITIES = 5
 
 
 class RadianceModule(FieldModule):
-    """Trains a field on rays, supervised by the images' colours.
+    """A LightningModule that trains a field on rays, supervised by the images' colours.
 
     The field is built in `configure_model`, when the scene is known; a configured LRM runs there,
     too. Checkpoints include everything the field takes from the data and the LRM, so

@@ -161,7 +161,7 @@ class OccupancyGrid(nn.Module):
         self.occupied[cells] = (self.density[cells] > self.empty_density) | self.kept[cells]
 
     @torch.no_grad()
-    def sweep(self, field: Field, generator: torch.Generator, chunk: int | None = None) -> None:
+    def sweep(self, field: Field, generator: torch.Generator) -> None:
         """Evaluate every occupied cell once, and empty those without density.
 
         A cell stays occupied if it or a spatial neighbour has density at one random point and time,
@@ -170,13 +170,10 @@ class OccupancyGrid(nn.Module):
         Args:
             field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
             generator: Source of randomness.
-            chunk: Points per call of the field; chosen for the device when None.
         """
         device = self.density.device
-        chunk = chunk or (2**15 if device.type == "cpu" else 2**19)
-        cells = self._occupied_cells()
         seen = torch.zeros_like(self.density)
-        for part in cells.split(chunk):
+        for part in self._occupied_cells().split(2**15 if device.type == "cpu" else 2**19):
             uniform = torch.rand(len(part), 4, generator=generator).to(device)
             seen[part] = self._usable(field(*self.draw(part, uniform))[1])
         size = self.resolution

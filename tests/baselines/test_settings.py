@@ -9,12 +9,13 @@ import torch
 from tests.balls import ball_scene, ball_views
 from tests.baselines.runs import TENSOR4D, baseline_config
 from tests.refusals import assert_refused
+from xplanes.baselines.bounds import check_range
 from xplanes.baselines.tineuvox.model import frusta_box
 from xplanes.errors import ConfigError
 from xplanes.experiment import Experiment
 from xplanes.models.initialisation import Method
 from xplanes.preparation.fixed_view import rendering_method
-from xplanes.rendering.sampler import Site, check_range
+from xplanes.rendering.sampler import Site
 from xplanes.scenes.frame import CubeHints, scene_frame
 from xplanes.streams import TrainingState
 from xplanes.training.module import RadianceModule

@@ -29,14 +29,14 @@ CONFIGS = {
         **OPENLRM,
         "encoder_model_name": "facebook/dino-vitb16",
         "encoder_feat_dim": 24,
-        "_reduced_encoder": DINO,
+        "encoder_sizes": DINO,
     },
     "openlrm-1.1": {
         **OPENLRM,
         "encoder_type": "dinov2",
         "encoder_model_name": "dinov2_vits14_reg",
         "encoder_feat_dim": 32,
-        "_reduced_encoder": {"img_size": 70, "embed_dim": 32, "depth": 2, "num_heads": 2},
+        "encoder_sizes": {"img_size": 70, "embed_dim": 32, "depth": 2, "num_heads": 2},
     },
     "triposr": {
         "cond_image_size": 64,
@@ -52,7 +52,7 @@ CONFIGS = {
         "post_processor": {"in_channels": 64, "out_channels": 6},
         "decoder": {"in_channels": 18, "n_neurons": 16, "n_hidden_layers": 3, "activation": "silu"},
         "renderer": {"radius": 0.87, "density_activation": "exp", "density_bias": -1.0},
-        "_reduced_encoder": DINO,
+        "encoder_sizes": DINO,
     },
 }
 """One configuration of each family; only OpenLRM 1.1's has equally wide image and plane tokens."""

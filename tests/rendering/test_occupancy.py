@@ -276,8 +276,8 @@ def test_swept_cells_without_content_of_their_own_have_one_more_look():
 def test_a_sweep_does_not_bring_empty_cells_back_and_asks_only_the_occupied():
     grid, field = grid_of(8, 1, decay=0.0), Even(9.0)
     grid.observe(torch.arange(256), torch.zeros(256))
-    grid.sweep(field, generator(), chunk=100)
-    assert [len(points) for points, _ in field.asked] == [100, 100, 56]
+    grid.sweep(field, generator())
+    assert [len(points) for points, _ in field.asked] == [256]
     assert not grid.occupied[:256].any()
     assert grid.occupied[256:].all()
 

@@ -174,7 +174,8 @@ def test_an_image_does_not_ask_for_what_surfaces_hide(monkeypatch):
         assert sum(asked) == pytest.approx(share * along, rel=0.01)
 
 
-def test_an_image_takes_a_snapshot_of_the_field_at_its_time():
+def test_an_image_takes_one_snapshot_of_the_field_at_its_time(monkeypatch):
+    monkeypatch.setattr(GridRenderer, "rays_at_once", 7)
     taken = []
 
     class Clock:
@@ -183,7 +184,7 @@ def test_an_image_takes_a_snapshot_of_the_field_at_its_time():
             return fog(9.0)
 
     origins, directions, _ = rays_of(20, torch.float32)
-    image = renderer_of().image(Clock(), origins, directions, 0.3, WHITE.float(), chunk=7)
+    image = renderer_of().image(Clock(), origins, directions, 0.3, WHITE.float())
     assert taken == [0.3]
     assert (image["opacity"] > 0).any()
 

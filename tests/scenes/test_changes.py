@@ -155,14 +155,6 @@ def test_cells_in_which_something_moves_stay_occupied():
         assert kept(others).occupied_fraction == 0
 
 
-def test_a_grid_from_before_cells_were_kept_is_loaded():
-    grid, old = OccupancyGrid(4, 1, step=0.05), OccupancyGrid(4, 1, step=0.05).state_dict()
-    grid.keep(torch.arange(64) < 5)
-    del old["kept"]
-    grid.load_state_dict(old)
-    assert grid.kept.sum() == 5
-
-
 def test_rays_see_more_of_what_changes_and_all_of_the_rest():
     views, _ = rig()
     settings = build(changed(())["model"], ModelSettings, "model").rays

@@ -157,17 +157,28 @@ def same_state(first: Mapping[str, Tensor], second: Mapping[str, Tensor]) -> Non
         assert torch.equal(value, second[name]), name
 
 
+def also(
+    patch: pytest.MonkeyPatch, owner: Any, name: str, do: Callable[..., Any], *, first: bool = False
+) -> None:
+    """Have a method do something else too, which gets its arguments: afterwards, or first."""
+    original = getattr(owner, name)
+
+    def both(*given: Any, **options: Any) -> Any:
+        if first:
+            do(*given, **options)
+        result = original(*given, **options)
+        if not first:
+            do(*given, **options)
+        return result
+
+    patch.setattr(owner, name, both)
+
+
 def after_each_batch(
     patch: pytest.MonkeyPatch, do: Callable[[TrainingClock, Any, RadianceModule], None]
 ) -> None:
     """Do something at the end of each batch, once the clock has seen it."""
-    original = TrainingClock.on_train_batch_end
-
-    def see(self: TrainingClock, trainer: Any, module: Any, *rest: Any) -> None:
-        original(self, trainer, module, *rest)
-        do(self, trainer, module)
-
-    patch.setattr(TrainingClock, "on_train_batch_end", see)
+    also(patch, TrainingClock, "on_train_batch_end", lambda *given: do(*given[:3]))
 
 
 def broken_off(steps: tuple[int, ...], config: dict[str, Any], folder: Path) -> None:

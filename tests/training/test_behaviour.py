@@ -13,6 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tests.training.runs import (
     UNSCORED,
     after_each_batch,
+    also,
     broken_off,
     checkpoint,
     metrics,
@@ -51,22 +52,20 @@ def watched(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNam
     config = small_config(scenes, f"data.cache={cache}", *sizes, "callbacks.evaluation.at=[0,0.6]")
     notes = SimpleNamespace(folder=folder, cache=cache, config=config, pictures=[], saved=[])
     score = RadianceModule.validation_step
-    save = AtomicCheckpointIO.save_checkpoint
 
     def note_picture(self, batch: dict, batch_idx: int) -> dict:
         image = score(self, batch, batch_idx)
         notes.pictures.append(weakref.ref(image["colour"]))
         return image
 
-    def note_checkpoint(self, checkpoint: dict, path: str, **options) -> None:
+    def note_checkpoint(_, checkpoint: dict, path: str, **__) -> None:
         notes.saved.append((checkpoint["global_step"], Path(path).name))
-        save(self, checkpoint, path, **options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(store, "IN_MEMORY", 0)
         patch.setattr(RadianceModule, "validation_step", note_picture)
         patch.setattr(evaluation, "SHOWN", 2)
-        patch.setattr(AtomicCheckpointIO, "save_checkpoint", note_checkpoint)
+        also(patch, AtomicCheckpointIO, "save_checkpoint", note_checkpoint)
         run(config, folder, [], resume=False)
     return notes
 
@@ -134,15 +133,12 @@ def stopped_at(folder: Path) -> tuple[int, int]:
 
 
 def test_a_second_interrupt_saves_no_half_of_a_step(train, tmp_path, monkeypatch):
-    original = RadianceModule.on_after_backward
-
-    def press_twice(self) -> None:
-        original(self)
-        if self.global_step == 5:
+    def press_twice(module) -> None:
+        if module.global_step == 5:
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(RadianceModule, "on_after_backward", press_twice)
+    also(monkeypatch, RadianceModule, "on_after_backward", press_twice)
     with pytest.raises(KeyboardInterrupt):
         train(*UNSCORED, "callbacks.checkpoints.every=3")
     assert stopped_at(tmp_path / "run") == (3, 3)
@@ -173,15 +169,12 @@ def test_interrupts_save_the_step_they_stop_at_and_evaluations_are_made_up_for(
     assert stopped_at(folder)[0] == 20
     assert steps(folder) == ["0"]
 
-    original = Evaluation.on_validation_start
-
-    def press(self, trainer, *rest) -> None:
+    def press(_, trainer, __) -> None:
         if trainer.global_step == 40:
             signal.raise_signal(signal.SIGINT)
-        original(self, trainer, *rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Evaluation, "on_validation_start", press)
+        also(patch, Evaluation, "on_validation_start", press, first=True)
         with pytest.raises(KeyboardInterrupt):
             train(seldom, resume=True)
     assert steps(folder) == ["0", "21"]
@@ -195,18 +188,14 @@ def test_interrupts_save_the_step_they_stop_at_and_evaluations_are_made_up_for(
 
 def test_an_evaluation_waits_for_the_update_of_its_batches(train, monkeypatch):
     """It may stop where it is, and the best checkpoint holds no gradients."""
-    start = Evaluation.on_validation_start
     batches = []
 
     def go_on(clock, _, module) -> None:
         clock.seconds = 600.0 if module.batches >= 7 else 0.0
 
-    def note(self, trainer, module) -> None:
-        batches.append(module.batches)
-        start(self, trainer, module)
-
     after_each_batch(monkeypatch, go_on)
-    monkeypatch.setattr(Evaluation, "on_validation_start", note)
+    note = lambda *given: batches.append(given[-1].batches)  # noqa: E731
+    also(monkeypatch, Evaluation, "on_validation_start", note)
     limits = ("trainer.max_seconds=1000", "trainer.max_steps=4")
     train("trainer.accumulate_grad_batches=3", *limits, "callbacks.evaluation.at=[0,0.55]")
     assert batches == [0, 9, 12]

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.balls import ball_scene
-from tests.training.runs import UNSCORED, metrics, outcome
+from tests.training.runs import UNSCORED, also, metrics, outcome
 from xplanes.errors import ConfigError
 from xplanes.files import read_rows
 from xplanes.models.base import background_opacity, opacity_error, opacity_shortfall
@@ -120,15 +120,12 @@ def test_a_dead_field_starts_again_once_and_a_resumed_run_comes_to_the_same_numb
     assert "at step 5" in words[0]
     assert "data.half_side" in words[1]
 
-    save = AtomicCheckpointIO.save_checkpoint
-
-    def cut_off(self, checkpoint: dict, path: str, **options) -> None:
-        save(self, checkpoint, path, **options)
+    def cut_off(_, __, path: str, **___) -> None:
         if Path(path).name == "last.ckpt":
             raise OSError("cut off")
 
     with monkeypatch.context() as patch:
-        patch.setattr(AtomicCheckpointIO, "save_checkpoint", cut_off)
+        also(patch, AtomicCheckpointIO, "save_checkpoint", cut_off)
         with pytest.raises(OSError, match="cut off"):
             train(*QUICK)
     assert outcome(train(*QUICK, resume=True)) == whole

@@ -17,6 +17,7 @@ from tests.refusals import assert_refused, flip
 from tests.training.runs import (
     UNSCORED,
     after_each_batch,
+    also,
     checkpoint,
     same_state,
     small_config,
@@ -76,14 +77,11 @@ def test_names_are_those_of_the_broken():
 
 
 def spoil_gradient(monkeypatch: pytest.MonkeyPatch, value: float, steps: range) -> None:
-    original = XPlanesModel.regularise
-
-    def spoil(self, state) -> None:
-        original(self, state)
+    def spoil(model, state) -> None:
         if state.batch in steps:
-            self.field.space.grad[0, 0, 0, 0] = value
+            model.field.space.grad[0, 0, 0, 0] = value
 
-    monkeypatch.setattr(XPlanesModel, "regularise", spoil)
+    also(monkeypatch, XPlanesModel, "regularise", spoil)
 
 
 @pytest.fixture
@@ -242,14 +240,12 @@ def folder(whole: Path, tmp_path: Path) -> Path:
 
 def test_a_resumed_run_takes_new_learning_rates(train, folder, monkeypatch):
     seen = []
-    original = RadianceModule.on_train_batch_start
 
-    def note(self, *rest) -> None:
-        original(self, *rest)
-        optimizer = self.optimizers().optimizer
+    def note(module, *_) -> None:
+        optimizer = module.optimizers().optimizer
         seen.append([group["lr"] for group in optimizer.param_groups])
 
-    monkeypatch.setattr(RadianceModule, "on_train_batch_start", note)
+    also(monkeypatch, RadianceModule, "on_train_batch_start", note)
     changed = ("trainer.max_steps=14", "model.plane_lr=0.02", "model.warmup_steps=0")
     train(*FEW, *changed, resume=True)
     assert len(seen) == 2

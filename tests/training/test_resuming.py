@@ -12,7 +12,7 @@ import pytest
 import yaml
 from lightning.pytorch.callbacks import Callback
 
-from tests.training.runs import UNSCORED, metrics, small_config, status
+from tests.training.runs import UNSCORED, also, metrics, small_config, status
 from xplanes.errors import ConfigError
 from xplanes.files import read_rows
 from xplanes.process import resume_command
@@ -20,7 +20,7 @@ from xplanes.readers.dnerf import BlenderSettings
 from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.tools.runs import load_run
-from xplanes.training import module
+from xplanes.training import field_module
 from xplanes.training.checkpoints import AtomicCheckpointIO, load_checkpoint
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import KEPT, RunRecord, require_same_run
@@ -43,13 +43,11 @@ def folder(trained_run: Path, tmp_path: Path) -> Path:
 def saved(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict]]:
     """Every checkpoint that is written, with the name of its file."""
     noted = []
-    save = AtomicCheckpointIO.save_checkpoint
 
-    def note(self, checkpoint: dict, path: str, **options) -> None:
+    def note(_, checkpoint: dict, path: str, **__) -> None:
         noted.append((Path(path).name, checkpoint))
-        save(self, checkpoint, path, **options)
 
-    monkeypatch.setattr(AtomicCheckpointIO, "save_checkpoint", note)
+    also(monkeypatch, AtomicCheckpointIO, "save_checkpoint", note)
     return noted
 
 
@@ -84,13 +82,13 @@ def test_a_run_is_not_resumed_with_other_images(train, folder):
 
 def test_the_best_is_chosen_by_the_same_views_throughout(train, monkeypatch, saved):
     """One view is scored on the way, and the others are harder by 10 dB."""
-    original = module.score_image
+    original = field_module.score_image
 
     def score(image, item):
         found = original(image, item)
         return replace(found, psnr=found.psnr - 10 * (item["index"] != 0))
 
-    monkeypatch.setattr(module, "score_image", score)
+    monkeypatch.setattr(field_module, "score_image", score)
     few = ("trainer.limit_val_batches=1", "callbacks.evaluation.at=[0,0.5]", "trainer.max_steps=4")
     folder = train(*few, "callbacks.checkpoints.every=99")
     assert [state["global_step"] for name, state in saved if name == "best.ckpt"] == [2, 4]
@@ -111,13 +109,8 @@ def test_no_checkpoint_between_the_batches_of_an_update(train, saved):
 
 
 def test_a_signal_after_the_last_step_is_heard(train, tmp_path, monkeypatch):
-    finish = RadianceModule.on_train_end
-
-    def press_ctrl_c(self) -> None:
-        finish(self)
-        signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(RadianceModule, "on_train_end", press_ctrl_c)
+    press_ctrl_c = lambda _: signal.raise_signal(signal.SIGINT)  # noqa: E731
+    also(monkeypatch, RadianceModule, "on_train_end", press_ctrl_c)
     with pytest.raises(KeyboardInterrupt):
         train(*FEW)
     assert status(tmp_path / "run")["status"] == "interrupted"

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
+from xplanes.baselines.bounds import check_range
 from xplanes.baselines.kplanes.field import DensityField
 from xplanes.baselines.products import PlaneProducts, PlaneTerms
 from xplanes.baselines.resampling import covering_weights, ray_weights, resample, uniform_edges
@@ -17,7 +18,7 @@ from xplanes.rendering.behind import behind
 from xplanes.rendering.box import ray_box, shade
 from xplanes.rendering.compositing import composite
 from xplanes.rendering.marching import Samples
-from xplanes.rendering.sampler import Group, Sampler, SamplerSettings, Site, check_range
+from xplanes.rendering.sampler import Group, Sampler, SamplerSettings, Site
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Count, Positive, Weight
 from xplanes.streams import Stream, TrainingState, initial_values

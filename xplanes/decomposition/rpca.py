@@ -137,7 +137,8 @@ def robust_pca(
         factor = 1.0 if 1e-12 < peak < 1e12 else 2.0 ** -math.frexp(peak)[1]
         if factor != 1:
             work = work * factor
-        unit = (_norm(work) / math.sqrt(work.numel())) if scale == "rms" else factor
+        norm, root = _norm(work), math.sqrt(work.numel())
+        unit = norm / root if scale == "rms" else factor
         with (
             _full_precision(work.device),
             tqdm(None, "robust PCA", max_iterations, False, delay=2, disable=not progress) as bar,
@@ -152,9 +153,7 @@ def robust_pca(
                 low_rank,
                 sparse,
                 sparsity_weight=weight,
-                penalty=penalty * math.sqrt(work.numel()) / _norm(work)
-                if adaptive
-                else penalty / unit,
+                penalty=penalty * root / norm if adaptive else penalty / unit,
                 adaptive=adaptive,
                 tolerance=tolerance,
                 max_iterations=max_iterations,

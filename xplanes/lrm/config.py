@@ -203,20 +203,16 @@ class Reader:
             raise self._error(key, value, "must be a whole number above zero")
         return value
 
-    def number(self, key: str, default: float) -> float:
-        """A number."""
-        value = self._value(key, default)
-        try:
-            return float(value)  # YAML 1.1 reads 1e-12 as text
-        except (TypeError, ValueError):
-            raise self._error(key, value, "must be a number") from None
-
     def positive(self, key: str, default: float) -> float:
         """A finite positive number."""
-        value = self.number(key, default)
-        if not 0 < value < math.inf:
-            raise self._error(key, value, "must be above zero")
-        return value
+        value = self._value(key, default)
+        try:
+            number = float(value)  # YAML 1.1 reads 1e-12 as text
+        except (TypeError, ValueError):
+            raise self._error(key, value, "must be a number") from None
+        if not 0 < number < math.inf:
+            raise self._error(key, number, "must be above zero")
+        return number
 
     def require(self, key: str, value: Any) -> None:
         """Refuse any value other than the supported one."""
@@ -313,7 +309,7 @@ def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig
     model = Reader(config).inner("model") if nested else Reader(config)
     # Keys that published files lack may be given inside or outside the section "model".
     given = Reader({**config, **model.values})
-    sizes = _encoder_sizes(given)
+    sizes = Reader(given.values.get("encoder_sizes") or {}, "encoder_sizes.")
     width, low = model.integer("transformer_dim"), model.integer("triplane_low_res")
     if model.integer("triplane_high_res", 2 * low) != 2 * low:
         raise LRMError(
@@ -352,12 +348,6 @@ def _openlrm(config: Mapping[str, Any], architecture: Architecture) -> LRMConfig
     )
 
 
-def _encoder_sizes(given: Reader) -> Reader:
-    """Sizes of a non-standard encoder, under either key."""
-    sizes = given.values.get("encoder_sizes") or given.values.get("_reduced_encoder")
-    return Reader(sizes or {}, "encoder_sizes.")
-
-
 def _triposr(config: Reader) -> LRMConfig:
     tokenizer, backbone = config.inner("tokenizer"), config.inner("backbone")
     upsampler, decoder = config.inner("post_processor"), config.inner("decoder")
@@ -372,7 +362,8 @@ def _triposr(config: Reader) -> LRMConfig:
     ):
         reader.require(key, value)
     name = config.inner("image_tokenizer").values.get("pretrained_model_name_or_path")
-    encoder = _dino(name, _encoder_sizes(config), config)
+    sizes = Reader(config.values.get("encoder_sizes") or {}, "encoder_sizes.")
+    encoder = _dino(name, sizes, config)
     width, channels = tokenizer.integer("num_channels"), upsampler.integer("out_channels")
     backbone.require("in_channels", width)
     backbone.require("cross_attention_dim", encoder.width)
@@ -397,8 +388,6 @@ def _dino(name: Any, sizes: Reader, given: Reader) -> EncoderConfig:
     if name != "facebook/dino-vitb16":
         raise LRMError(f"the image encoder {name!r} is not supported: only facebook/dino-vitb16")
     patch = sizes.integer("patch_size", 16)
-    mean = given.triple("image_mean", sizes.triple("image_mean", IMAGENET_MEAN))
-    std = given.triple("image_std", sizes.triple("image_std", IMAGENET_STD))
     return EncoderConfig(
         width=sizes.integer("hidden_size", 768),
         depth=sizes.integer("num_hidden_layers", 12),
@@ -406,9 +395,9 @@ def _dino(name: Any, sizes: Reader, given: Reader) -> EncoderConfig:
         hidden=sizes.integer("intermediate_size", 3072),
         patch=patch,
         grid=sizes.integer("image_size", 224) // patch,
-        norm_epsilon=sizes.number("layer_norm_eps", 1e-12),
-        mean=mean,
-        std=std,
+        norm_epsilon=1e-12,
+        mean=given.triple("image_mean", IMAGENET_MEAN),
+        std=given.triple("image_std", IMAGENET_STD),
     )
 
 
@@ -419,13 +408,11 @@ def _dinov2(name: Any, sizes: Reader) -> EncoderConfig:
         )
     width, heads = DINOV2[name]
     width, patch = sizes.integer("embed_dim", width), sizes.integer("patch_size", 14)
-    sizes.require("interpolate_antialias", True)
-    sizes.require("interpolate_offset", 0.0)
     return EncoderConfig(
         width=width,
         depth=sizes.integer("depth", 12),
         heads=sizes.integer("num_heads", heads),
-        hidden=sizes.integer("mlp_ratio", 4) * width,
+        hidden=4 * width,
         patch=patch,
         grid=sizes.integer("img_size", 518) // patch,
         norm_epsilon=1e-6,

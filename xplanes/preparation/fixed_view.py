@@ -188,12 +188,7 @@ def pick_frames(video: Views, timesteps: Tensor) -> Views:
 
 
 def canonical_pose(
-    views: Views,
-    frame: Frame,
-    view: CanonicalView,
-    *,
-    azimuth: float | None,
-    elevation: float,
+    views: Views, frame: Frame, view: CanonicalView, *, azimuth: float | None, elevation: float
 ) -> Tensor:
     """Camera pose for which both the LRM's box and its image contain the scene.
 
@@ -221,12 +216,7 @@ def canonical_pose(
 
 
 def _rendered(
-    method: Method,
-    place: Place,
-    view: CanonicalView,
-    size: int,
-    count: int,
-    cache: StageCache,
+    method: Method, place: Place, view: CanonicalView, size: int, count: int, cache: StageCache
 ) -> FixedView:
     options, scene, frame = method.preparation, place.scene, place.frame
     train = scene.splits["train"]
@@ -298,13 +288,7 @@ def intrinsics_key(intrinsics: Intrinsics) -> list[Tensor]:
 
 
 def trained_field(
-    method: Method,
-    place: Place,
-    folder: Path,
-    *,
-    steps: int,
-    seconds: float | None,
-    advice: str,
+    method: Method, place: Place, folder: Path, *, steps: int, seconds: float | None, advice: str
 ) -> "RadianceModule":
     """Train a field for a short time; an interrupted training is resumed.
 
@@ -328,12 +312,7 @@ def trained_field(
     module.build(place.scene, place.frame, device=place.device, say=place.say)
     module.advice = advice
     fit_quietly(
-        module,
-        place.scene,
-        folder,
-        device=place.device,
-        max_steps=steps,
-        max_seconds=seconds,
+        module, place.scene, folder, device=place.device, max_steps=steps, max_seconds=seconds
     )
     return module.eval()
 

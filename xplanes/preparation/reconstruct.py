@@ -108,11 +108,7 @@ def loaded(model: LRM, path: Path, began: float) -> LoadedLRM:
 
 
 def reconstruct(
-    method: Method,
-    options: ImageLRMSettings,
-    place: Place,
-    lrm: LoadedLRM,
-    cache: StageCache,
+    method: Method, options: ImageLRMSettings, place: Place, lrm: LoadedLRM, cache: StageCache
 ) -> Reconstruction:
     """Predict the triplane sequence of a scene.
 

@@ -16,6 +16,7 @@ from xplanes.models.initialisation import DecompositionSettings
 from xplanes.models.x_planes import XPlanesSettings
 from xplanes.preparation.cache import Stage, StageCache
 from xplanes.preparation.encode import straight_alpha
+from xplanes.rendering.pictures import first_colours
 from xplanes.scenes.views import spread
 from xplanes.streams import Stream, step_generator
 
@@ -37,7 +38,7 @@ def parts_sheet(low_rank: Tensor, sparse: Tensor) -> Tensor:
         Colours from 0 to 1. [3 (side + 4), M 2 (side + 4), 3]
     """
     chosen, side = spread(PARTS_TIMES, len(low_rank)), PARTS_SIDE
-    static, moving = (_colours(part[chosen]) for part in (low_rank, sparse))
+    static, moving = (first_colours(part[chosen]) for part in (low_rank, sparse))
     static = static - static.mean(dim=(0, 3, 4), keepdim=True)
     spread_of = 5 * static.std(dim=(0, 3, 4), correction=0, keepdim=True).clamp_min(1e-8)
     peak = 2 * moving.abs().amax(dim=(0, 2, 3, 4), keepdim=True).clamp_min(1e-8)
@@ -48,13 +49,6 @@ def parts_sheet(low_rank: Tensor, sparse: Tensor) -> Tensor:
     # [timestep, part, orientation, colour, row, column], with orientations below one another.
     sheet = tiles.view(len(chosen), 2, 3, 3, size, size).permute(2, 4, 0, 1, 5, 3)
     return sheet.reshape(3 * size, len(chosen) * 2 * size, 3)
-
-
-def _colours(planes: Tensor) -> Tensor:
-    """The first three channels; the first one is repeated if there are fewer. [M, 3, 3, H, W]"""
-    shown = planes[:, :, :3].detach().float().cpu()
-    missing = 3 - shown.shape[2]
-    return torch.cat([shown, shown[:, :, :1].expand(-1, -1, missing, -1, -1)], dim=2)
 
 
 def contact_sheet(frames: Tensor, crop: Crop, model: LRM) -> Tensor:

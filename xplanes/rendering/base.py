@@ -143,14 +143,7 @@ class RayRenderer(Renderer):
 
     @torch.no_grad()
     def image(
-        self,
-        field: Any,
-        origins: Tensor,
-        directions: Tensor,
-        time: float,
-        background: Tensor,
-        *,
-        chunk: int | None = None,
+        self, field: Any, origins: Tensor, directions: Tensor, time: float, background: Tensor
     ) -> dict[str, Tensor]:
         """Render any number of rays of one timestep, a chunk at a time.
 
@@ -159,7 +152,7 @@ class RayRenderer(Renderer):
         """
         field, parts = snapshot(field, time), []
         renderer = self.for_image(field, time, len(origins))
-        chunk = chunk or self.rays_at_once * (1 if self.device.type == "cpu" else 2)
+        chunk = self.rays_at_once * (1 if self.device.type == "cpu" else 2)
         for start in range(0, max(len(origins), 1), chunk):
             rays = origins[start : start + chunk], directions[start : start + chunk]
             times = torch.full_like(rays[0][:, 0], time)

@@ -266,12 +266,7 @@ def _kernels_hold(device: torch.device, dtype: torch.dtype) -> bool:
 
 
 def _march_cpu(
-    rays: Rays,
-    grid: OccupancyGrid,
-    *,
-    step: float,
-    occupied: Tensor | None,
-    limit: float,
+    rays: Rays, grid: OccupancyGrid, *, step: float, occupied: Tensor | None, limit: float
 ) -> Samples:
     cpu = compiled("xplanes.rendering.rays_numba")
     near, far = ray_box(rays.origins, rays.directions)

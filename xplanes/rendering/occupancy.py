@@ -62,7 +62,6 @@ class OccupancyGrid(nn.Module):
         self.register_buffer("density", torch.full((cells,), 4 * self.empty_density))
         self.register_buffer("least", torch.zeros(cells))
         self.register_buffer("occupied", torch.ones(cells, dtype=torch.bool))
-        self.register_load_state_dict_pre_hook(_without_kept)
 
     def bins(self, times: Tensor) -> Tensor:
         """Time bin of each time from 0 to 1. int64 [N]"""
@@ -162,7 +161,7 @@ class OccupancyGrid(nn.Module):
         self.occupied[cells] = (self.density[cells] > self.empty_density) | self.kept[cells]
 
     @torch.no_grad()
-    def sweep(self, field: Field, generator: torch.Generator, chunk: int | None = None) -> None:
+    def sweep(self, field: Field, generator: torch.Generator) -> None:
         """Evaluate every occupied cell once, and empty those without density.
 
         A cell stays occupied if it or a spatial neighbour has density at one random point and time,
@@ -171,13 +170,10 @@ class OccupancyGrid(nn.Module):
         Args:
             field: From points [N, 3] and times [N] to colour [N, 3] and density [N].
             generator: Source of randomness.
-            chunk: Points per call of the field; chosen for the device when None.
         """
         device = self.density.device
-        chunk = chunk or (2**15 if device.type == "cpu" else 2**19)
-        cells = self._occupied_cells()
         seen = torch.zeros_like(self.density)
-        for part in cells.split(chunk):
+        for part in self._occupied_cells().split(2**15 if device.type == "cpu" else 2**19):
             uniform = torch.rand(len(part), 4, generator=generator).to(device)
             seen[part] = self._usable(field(*self.draw(part, uniform))[1])
         size = self.resolution
@@ -300,8 +296,3 @@ class OccupancyGrid(nn.Module):
         index = [cells % size, cells // size % size, cells // size**2 % size, cells // size**3]
         place = torch.stack(index, dim=-1) + uniform
         return place[:, :3] * (2 / size) - 1, place[:, 3] / self.time_bins
-
-
-def _without_kept(grid: OccupancyGrid, state: dict[str, Tensor], prefix: str, *_: object) -> None:
-    """Load older checkpoints, which lack ``kept``, without changing it."""
-    state.setdefault(f"{prefix}kept", grid.kept)

@@ -54,6 +54,12 @@ def strip(truth: Tensor, colour: Tensor, depth: Tensor, opacity: Tensor) -> Tens
     return torch.cat([truth, colour, error, depth_picture(depth, opacity)], dim=1)
 
 
+def first_colours(planes: Tensor) -> Tensor:
+    """The first three channels, the first one for missing ones. [..., C, H, W] -> [..., 3, H, W]"""
+    channels = [channel if channel < planes.shape[-3] else 0 for channel in range(3)]
+    return planes[..., channels, :, :].detach().float().cpu()
+
+
 def plane_sheet(planes: Mapping[str, Tensor]) -> Tensor:
     """Feature planes as pictures, three channels of each as colours, three pictures per row.
 
@@ -65,8 +71,7 @@ def plane_sheet(planes: Mapping[str, Tensor]) -> Tensor:
     """
     tiles = []
     for plane in planes.values():
-        shown = plane.detach().float().cpu()[:3]
-        shown = torch.cat([shown, shown[:1].expand(3 - len(shown), -1, -1)])
+        shown = first_colours(plane)
         spread = 2.5 * shown.std().clamp_min(1e-8)
         shown = ((shown - shown.mean()) / (2 * spread) + 0.5).clamp(0, 1)
         tile = F.interpolate(shown[None], size=(128, 128), mode="nearest")[0].permute(1, 2, 0)

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from typing import Any, TextIO
+from typing import Any
 
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
@@ -19,14 +19,11 @@ class StepBar(ProgressBar):
 
     On a terminal one line is redrawn; elsewhere a new line is written every 30 s, without control
     codes.
-
-    Args:
-        stream: Output stream; standard output when None.
     """
 
-    def __init__(self, stream: TextIO | None = None) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.stream = stream or sys.stdout
+        self.stream = sys.stdout
         self.live = self.stream.isatty()
         self._every = LIVE_SECONDS if self.live else PIPED_SECONDS
         self._shown, self._due, self._width = True, 0.0, 0

@@ -249,7 +249,7 @@ def parts_from(
     if not content["initialised"] or settings.name != method.model.name:
         settings = method.model  # Loading the weights of another model fails later.
     cameras, exposed = (
-        None if (groups := content.get(name)) is None else CameraGroups(**groups)
+        None if (groups := content[name]) is None else CameraGroups(**groups)
         for name in ("cameras", "exposed")
     )
     site = Site(
@@ -258,7 +258,7 @@ def parts_from(
         seed=method.seed,
         precision=precision_of(settings, torch.device("cpu")),
         bounds=content["bounds"],
-        positions=content.get("positions"),
+        positions=content["positions"],
         initialised=content["initialised"],
         pixels=content["pixels"],
         coherence=content.get("coherence", 0.0),

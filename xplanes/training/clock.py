@@ -176,13 +176,7 @@ class Interrupt(Callback):
             self.check()
 
     def on_test_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, pl_module: LightningModule, *_: Any, **__: Any
     ) -> None:
         if trainer.world_size == 1:  # Several processes must stop together, after a step.
             self.check()

@@ -61,8 +61,8 @@ class CollapseWatch(Callback):
         if not found:
             self.collapsed = ""
             return
-        alone = trainer.world_size == 1
-        if pl_module.restarts < self.restarts and alone and pl_module.can_restart:
+        left = pl_module.restarts < self.restarts and trainer.world_size == 1
+        if left and pl_module.parts.settings.stronger() is not None:
             logger.warning(
                 "%s at step %d: re-initialised with another seed and stronger supervision of "
                 "opacity",
@@ -84,7 +84,7 @@ class CollapseWatch(Callback):
         return {"since": self._since, "collapsed": self.collapsed, "seen": self._seen}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._since, self.collapsed = state_dict.get("since", 0), state_dict["collapsed"]
+        self._since, self.collapsed = state_dict["since"], state_dict["collapsed"]
         self._seen = [tuple(pair) for pair in state_dict["seen"]]
 
 

@@ -169,7 +169,7 @@ class Evaluation(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.seconds, self._passed = state_dict["seconds"], state_dict["passed"]
-        self._rows = list(state_dict.get("rows", []))
+        self._rows = list(state_dict["rows"])
 
 
 def forget_later(trainer: Trainer, step: int) -> None:

@@ -201,31 +201,22 @@ def fit_quietly(
 
 def warm_up_loops(module: RadianceModule, data: SceneDataModule, device: torch.device) -> None:
     """Run all loops once on a few rays, so that the training clock does not count compilation."""
-    if device.type != "cpu":
-        # The kernels' trial needs the training device; Lightning would move the module only later.
-        module.to(device)
-    elif not cpu_loops(next(module.field.parameters())):
+    # The kernels' trial needs the training device; Lightning would move the module only later.
+    module.to(device)
+    on_cpu = device.type == "cpu"
+    if on_cpu and not cpu_loops(next(module.field.parameters())):
         return
-    batches = data.batches_for(module, 0)
-    rays = move_data_to_device(batches.draw(0, 8), device)
+    rays = move_data_to_device(data.batches_for(module, 0).draw(0, 8), device)
     with warming_up():
-        if device.type != "cpu":
-            rehearse(module, rays)
-            synchronize(device)
-            return
-        sampler = copy.deepcopy(module.sampler)
-        rendering = sampler.render(module.field, rays, module.state)
-        rendering.colour.sum().backward()
-        sampler.observe(rendering)
-        module.model.regularise(module.state)
-        module.zero_grad(set_to_none=True)
-        if isinstance(module.renderer, RayRenderer):
+        rehearse(module, rays)
+        synchronize(device)
+        if on_cpu and isinstance(module.renderer, RayRenderer):
             ends = rays["origins"], rays["directions"]
             module.renderer.image(module.field, *ends, 0.0, data.scene.background)
 
 
 def rehearse(module: RadianceModule, rays: Batch) -> None:
-    """Run a complete step on a copy of the field, so that its kernels are compiled."""
+    """Run a complete step on a copy of the field, so that its loops or kernels are compiled."""
     site, state = module.site, module.state
     copied = copy.deepcopy(module.parts, {id(site): site})  # The site holds all images.
     model, sampler = copied.model, copied.sampler

@@ -4,27 +4,21 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from lightning import LightningModule
 from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.core.optimizer import LightningOptimizer
-from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 
 from xplanes import __version__
 from xplanes.components import plugins
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
-from xplanes.fields.base import Representation
 from xplanes.files import stand_in
-from xplanes.models.base import Model
-from xplanes.models.initialisation import Initialisation, Method
-from xplanes.rendering.base import Renderer, Rendering
-from xplanes.rendering.sampler import Sampler, Site
+from xplanes.models.initialisation import Method
+from xplanes.rendering.base import Rendering
 from xplanes.scenes.batches import Batch, BatchSettings
 from xplanes.scenes.frame import Frame
 from xplanes.scenes.importance import START, ErrorMap
@@ -49,8 +43,8 @@ from xplanes.training.diagnosis import (
     leave_out,
     unusable_gradients,
 )
-from xplanes.training.meters import Tally, batch_values, due, mean_opacities
-from xplanes.training.scores import ViewScore, gathered, mean_scores, render_item, score_image
+from xplanes.training.field_module import FieldModule
+from xplanes.training.meters import batch_values, due, mean_opacities
 
 PATIENCE = 20
 """Training fails after this many consecutive updates with a loss or gradient that is not finite."""
@@ -59,8 +53,8 @@ OPACITIES = 5
 """Batches between measurements of the rays' opacity."""
 
 
-class RadianceModule(LightningModule):
-    """Trains a field on rays, supervised by the images' colours.
+class RadianceModule(FieldModule):
+    """A LightningModule that trains a field on rays, supervised by the images' colours.
 
     The field is built in `configure_model`, when the scene is known; a configured LRM runs there,
     too. Checkpoints include everything the field takes from the data and the LRM, so
@@ -69,7 +63,7 @@ class RadianceModule(LightningModule):
     A step is `training_step` (render the rays, sum the loss terms), `on_before_optimizer_step`
     (gradients of regularisers without rays; non-finite updates are skipped) and
     `optimizer_step` (the optimiser, then the update of the occupancy grid). Validation and test
-    score whole views, as `SceneDataModule` serves them.
+    score whole views, as `SceneDataModule` serves them; see `FieldModule`.
 
     Args:
         config: The keys ``seed``, ``model``, ``lrm``, ``preparation``, ``decomposition`` and
@@ -102,11 +96,6 @@ class RadianceModule(LightningModule):
         """Advice if the loss is not finite; the model's own when None."""
         self.between_updates = True
         """Whether no accumulated gradients are pending (see ``accumulate_grad_batches``)."""
-        self.scores: list[ViewScore] = []
-        """Scores of the views of the last validation or test, from all processes."""
-        self.tally = Tally()
-        self._tag = ""
-        self._parts: Parts | None = None
         self._seen: tuple[Rendering, dict[str, Tensor]] | None = None
         self._losses: list[Tensor] = []
         self._steps = math.inf
@@ -197,76 +186,11 @@ class RadianceModule(LightningModule):
 
     def _adopt(self, parts: Parts) -> None:
         self._parts = parts
-        self.field: Representation = parts.field
+        self.field = parts.field
         self.error_map = ErrorMap(parts.site.steps(START))
         for name, part in parts.sampler.modules.items():
             self.add_module(name, part)
         self.rays = parts.sampler.first_rays(self.ray_settings.most_rays)
-
-    @property
-    def parts(self) -> Parts:
-        """The field with its model and sampler.
-
-        Raises:
-            ConfigError: If they are not built yet.
-        """
-        if self._parts is None:
-            raise ConfigError(
-                "the field is not built yet: fit with a SceneDataModule, or load a checkpoint"
-            )
-        return self._parts
-
-    @property
-    def model(self) -> Model:
-        """The field's losses and learning rates."""
-        return self.parts.model
-
-    @property
-    def sampler(self) -> Sampler:
-        """The sampler, which renders training batches."""
-        return self.parts.sampler
-
-    @property
-    def site(self) -> Site:
-        """Context for which the field was built."""
-        return self.parts.site
-
-    @property
-    def initialisation(self) -> Initialisation | None:
-        """The initialisation; None if the field was loaded."""
-        return self.parts.initialisation
-
-    @property
-    def frame(self) -> Frame | None:
-        """The field's frame; None before it is built."""
-        return None if self._parts is None else self._parts.site.frame
-
-    @property
-    def renderer(self) -> Renderer:
-        """Renders images of the field."""
-        return self.parts.sampler.renderer
-
-    def corrected(self, poses: Tensor) -> Tensor:
-        """World poses with the corrections that training has learnt. [V, 4, 4]"""
-        frame = self.frame
-        return poses if frame is None else self.sampler.corrected(poses, frame)
-
-    def corrected_scene(self, scene: Scene) -> Scene:
-        """A scene with corrected poses."""
-        splits = {
-            name: replace(views, camera_to_world=self.corrected(views.camera_to_world))
-            for name, views in scene.splits.items()
-        }
-        return replace(scene, splits=splits)
-
-    @property
-    def _ddp_params_and_buffers_to_ignore(self) -> list[str]:
-        """Buffers that DDP does not broadcast from the first process before each step.
-
-        The occupancy grid takes 20 MB; the processes synchronise it at intervals.
-        """
-        modules = self.sampler.modules.items()
-        return [f"{name}.{key}" for name, part in modules for key, _ in part.named_buffers()]
 
     # Training
 
@@ -434,11 +358,6 @@ class RadianceModule(LightningModule):
         assert self._seen is not None
         raise TrainingError(diagnosis(self, *self._seen, unusable))
 
-    @property
-    def can_restart(self) -> bool:
-        """Whether the model has settings for a restart after a collapse."""
-        return self.parts.settings.stronger() is not None
-
     def restart(self) -> None:
         """Re-initialise the field, with another seed and the model's settings for a restart.
 
@@ -452,56 +371,6 @@ class RadianceModule(LightningModule):
         for group, new in zip(optimizer.param_groups, fresh, strict=True):
             group["params"] = new["params"]
         optimizer.state.clear()
-
-    # Scores
-
-    def predict_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
-        """One view: ``colour`` [H, W, 3], ``opacity`` and ``depth`` [H, W]."""
-        camera = batch["camera"]
-        pose = self.corrected(camera.camera_to_world[None])[0]
-        item = batch | {"camera": replace(camera, camera_to_world=pose)}
-        return render_item(self.field, self.renderer, self.site.frame, item)
-
-    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> dict[str, Tensor]:
-        """Render and score a view; the mean scores are logged at the end of the epoch."""
-        image = self.predict_step(batch, batch_idx)
-        self.scores.append(score_image(image, batch))
-        self._tag = batch["tag"]
-        return image
-
-    test_step = validation_step
-
-    def on_validation_epoch_start(self) -> None:
-        self.agree()
-        self.scores = []
-
-    on_test_epoch_start = on_validation_epoch_start
-
-    def on_validation_epoch_end(self) -> None:
-        self.scores = gathered(self.scores, self.trainer)
-        tag = self.trainer.strategy.broadcast(self._tag)  # A process may have had no view.
-        means = {f"{tag}/{name}": value for name, value in mean_scores(self.scores).items()}
-        self.tally.last |= means
-        if self.trainer.state.fn == TrainerFn.FITTING:
-            # Lightning's own count is one less, and restarts in a resumed run.
-            means["step"] = float(self.trainer.global_step)
-        # All processes already have the means of all views; sync_dist avoids Lightning's warning.
-        self.log_dict(means, batch_size=1, sync_dist=self.trainer.world_size > 1)
-
-    on_test_epoch_end = on_validation_epoch_end
-
-    def agree(self) -> None:
-        """Copy the sampler's buffers from the first process to all others.
-
-        Each has observed only its own rays; with equal buffers all score and save the same field.
-        """
-        if self._trainer is None or self._trainer.world_size == 1:
-            return
-        for part in self.sampler.modules.values():
-            own = getattr(part, "own", ())
-            for name, buffer in part.named_buffers():
-                if name not in own:
-                    torch.distributed.broadcast(buffer, src=0)
 
     # Checkpoints
 
@@ -530,8 +399,7 @@ class RadianceModule(LightningModule):
             self.restarts = progress["restarts"]
             self.batches, self.rays = progress["batches"], progress["rays"]
             self.tally.load_state_dict(progress)
-            if "error_map" in checkpoint:  # Absent in checkpoints of earlier versions.
-                self.error_map.load_state_dict(checkpoint["error_map"])
+            self.error_map.load_state_dict(checkpoint["error_map"])
         except (KeyError, TypeError, AttributeError) as error:
             raise ConfigError(
                 f"the checkpoint cannot be used ({type(error).__name__}: {error}): it is damaged, "

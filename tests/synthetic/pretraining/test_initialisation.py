@@ -93,10 +93,6 @@ def test_the_camera_and_scale_have_the_published_defaults():
         for wrong in (0, -1.0, float("inf"), "far"):
             call = partial(parse_config, {**SIZES, key: wrong})
             assert_refused(LRMError, key, call, f"{key}={wrong}")
-    # Sizes of the encoder go by either name.
-    sizes = dict(SIZES)
-    sizes["_reduced_encoder"] = sizes.pop("encoder_sizes")
-    assert parse_config(sizes) == parse_config(SIZES)
 
 
 def test_settings_that_cannot_work_are_refused_by_name():

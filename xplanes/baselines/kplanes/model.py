@@ -5,17 +5,12 @@ from typing import ClassVar, Literal
 
 import torch
 
+from xplanes.baselines.bounds import fits_origin_cube, origin_cube, seen_range
 from xplanes.baselines.kplanes.field import ExplicitDecoder, HybridDecoder, KPlanes
 from xplanes.baselines.products import PlaneProducts, PlaneTerms, Variation
 from xplanes.errors import ConfigError
 from xplanes.models.base import InitialValues, Model, ModelSettings, warm_cosine
-from xplanes.rendering.sampler import (
-    Group,
-    Site,
-    fits_origin_cube,
-    origin_cube,
-    seen_range,
-)
+from xplanes.rendering.sampler import Group, Site
 from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame, scene_frame
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Positive, Settings, Steps, Weight

@@ -7,13 +7,14 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from xplanes.baselines.bounds import check_range
 from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.behind import behind
 from xplanes.rendering.compositing import composite
 from xplanes.rendering.marching import Samples
-from xplanes.rendering.sampler import Sampler, SamplerSettings, Site, check_range
+from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
 from xplanes.scenes.batches import Batch
 from xplanes.settings import Positive, Range, Weight
 from xplanes.streams import TrainingState

@@ -7,13 +7,14 @@ from typing import Annotated, Any, ClassVar
 import torch
 from torch import Tensor
 
+from xplanes.baselines.bounds import origin_cube, seen_range
 from xplanes.baselines.tineuvox.field import TiNeuVox
 from xplanes.baselines.tineuvox.fixed_step import FixedStepRendering
 from xplanes.errors import ConfigError
 from xplanes.models.background import BackgroundSettings
 from xplanes.models.base import InitialValues, Model, ModelSettings, colour_error
 from xplanes.rendering.base import Rendering
-from xplanes.rendering.sampler import Group, Site, origin_cube, seen_range
+from xplanes.rendering.sampler import Group, Site
 from xplanes.scenes.batches import Batch
 from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame, cube_frame, scene_frame
 from xplanes.scenes.views import Views

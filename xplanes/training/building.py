@@ -261,7 +261,7 @@ def parts_from(
         positions=content["positions"],
         initialised=content["initialised"],
         pixels=content["pixels"],
-        coherence=content.get("coherence", 0.0),
+        coherence=content["coherence"],
         surrounded=content["surrounded"],
         cameras=cameras,
         exposed=exposed,

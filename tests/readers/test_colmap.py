@@ -82,8 +82,8 @@ def rays(model, index, rows, columns):
     camera = model.calibrations[index]
     size = (int(camera.h), int(camera.w))
     focal, centre, skew = camera.scaled(size, size)
-    row = torch.zeros(1, len(COEFFICIENTS), dtype=torch.float64)
-    row[0, : len(camera.distortion)] = torch.tensor(camera.distortion, dtype=torch.float64)
+    row = [[camera.distortion.get(name, 0.0) for name in COEFFICIENTS]]
+    row = torch.tensor(row, dtype=torch.float64)
     lens = Lenses(torch.tensor([int(camera.model)]), row, torch.tensor([skew]))
     pixels = (torch.tensor(places, dtype=torch.float64) for places in (rows, columns))
     pose = torch.from_numpy(model.camera_to_world[index])

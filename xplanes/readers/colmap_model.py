@@ -383,9 +383,9 @@ def _calibration(
                 f"{label} has {key}={value}; it must be a finite number"
                 f"{' above 0' if key in sizes else ''}. Export the model again, or calibrate again."
             )
-    distortion = tuple(known.get(name, 0.0) for name in COEFFICIENTS)
+    distortion = {name: known[name] for name in COEFFICIENTS if name in known}
     if lens == LensModel.FOV:
-        distortion = (known["omega"],)
+        distortion = {"k1": known["omega"]}
         if not 0 <= known["omega"] < math.pi:
             raise SceneError(
                 f"{label} has omega={known['omega']}; it must lie between 0 and pi radians. "
@@ -399,7 +399,7 @@ def _calibration(
         w=width,
         h=height,
         model=lens,
-        distortion=distortion if any(distortion) else (),
+        distortion=distortion,
     )
 
 

@@ -121,13 +121,9 @@ def usable(what: str, read: Callable[[Item], Found], items: Sequence[Item]) -> l
     return found
 
 
-def _stems(folder: Path) -> dict[str, list[Path]]:
-    """Images of a folder by name without suffix, in lower case."""
-    return _stems_at(folder, folder.stat().st_mtime_ns)
-
-
 @lru_cache(maxsize=64)
-def _stems_at(folder: Path, changed: int) -> dict[str, list[Path]]:
+def _stems(folder: Path, changed: int) -> dict[str, list[Path]]:
+    """Images of a folder, changed at a time, by name without suffix, in lower case."""
     found: dict[str, list[Path]] = {}
     inside = sorted(folder.iterdir())
     if len(inside) == 1 and inside[0].is_dir():  # The archive was unpacked one level too deep.
@@ -148,9 +144,8 @@ def _like(folder: Path) -> Path | None:
         return folder
     if (parent := _like(folder.parent)) is None:
         return None
-    names = [
-        path for path in parent.iterdir() if _normalised(path.name) == _normalised(folder.name)
-    ]
+    wanted = _normalised(folder.name)
+    names = [path for path in parent.iterdir() if _normalised(path.name) == wanted]
     return names[0] if len(names) == 1 and names[0].is_dir() else None
 
 
@@ -161,7 +156,7 @@ def _similar(image: Path) -> Path | None:
     if (parent := _like(image.parent)) is None:
         return None
     wanted = image.stem if image.suffix.lower() in ENDINGS else image.name
-    found = _stems(parent).get(_normalised(wanted), [])
+    found = _stems(parent, parent.stat().st_mtime_ns).get(_normalised(wanted), [])
     same = [path for path in found if _normalised(path.name) == _normalised(image.name)]
     chosen = [path for path in same if path.suffix == image.suffix] or same or found
     return chosen[0] if len(chosen) == 1 else None
@@ -482,38 +477,6 @@ def origin_near(source: Path, positions: np.ndarray, movable: bool = True) -> np
             f"({x:.0f}, {y:.0f}, {z:.0f}): data.centre and exports are as well."
         )
     return origin
-
-
-def refuse_repeats(
-    labels: Sequence[str], paths: Sequence[Path], poses: np.ndarray, times: Sequence[float]
-) -> None:
-    """Refuse images that are listed twice.
-
-    Args:
-        labels: The file and frame of each image, for messages. [V]
-        paths: Image files. [V]
-        poses: Their cameras. [V, 4, 4]
-        times: Their times; equal or empty for a static scene, whose cameras may repeat. [V]
-
-    Raises:
-        SceneError: If a file, or a pair of camera and time, occurs twice.
-    """
-    files: dict[Path, str] = {}
-    seen: dict[tuple[bytes, float], str] = {}
-    moving = len(set(times)) > 1
-    for index, label in enumerate(labels):
-        other = files.setdefault(paths[index], label)
-        if other is not label:
-            raise SceneError(f"{label} has the same file as {other}. Remove one of the two.")
-        # In a static scene, a camera may pass the same place twice.
-        if not moving:
-            continue
-        other = seen.setdefault((poses[index].tobytes(), times[index]), label)
-        if other is not label:
-            raise SceneError(
-                f"{label} has the same camera and time as {other}. Remove one of the two, or "
-                f"correct its time."
-            )
 
 
 def is_number(value: Any) -> TypeGuard[float]:

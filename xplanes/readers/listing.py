@@ -1,8 +1,8 @@
 """Lists of images with poses and times, and their conversion to views."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from xplanes.errors import MissingSplitError, SceneError, refuse_all, some, warn
-from xplanes.readers.entries import origin_near, refuse_repeats
+from xplanes.readers.entries import origin_near
 from xplanes.readers.formats import UNTURN, mask_misfit, orientation
 from xplanes.readers.images import GREY, Picture, Size, final_sizes, native_sizes, read_images
 from xplanes.readers.masks import MaskKind, ignored_pixels
@@ -48,7 +48,7 @@ class Calibration:
         w: Width of the image to which these numbers refer; None for that of the image file.
         h: Its height.
         model: Kind of lens.
-        distortion: Coefficients in the order of `COEFFICIENTS`; empty if there is no distortion.
+        distortion: Coefficients by their names in `COEFFICIENTS`; others are 0.
         skew: Shift to the right in pixels per focal length downwards.
     """
 
@@ -60,7 +60,7 @@ class Calibration:
     w: float | None = None
     h: float | None = None
     model: LensModel = LensModel.PERSPECTIVE
-    distortion: tuple[float, ...] = ()
+    distortion: Mapping[str, float] = field(default_factory=dict)
     skew: float = 0.0
 
     def scaled(
@@ -92,8 +92,8 @@ class Calibration:
         """Description of the lens, for messages."""
         named = [
             f"{'omega' if self.model == LensModel.FOV else name}={value:g}"
-            for name, value in zip(COEFFICIENTS, self.distortion, strict=False)
-            if value
+            for name in COEFFICIENTS
+            if (value := self.distortion.get(name))
         ]
         return f"{self.model.name.lower()} lens with {', '.join(named) or 'no distortion'}"
 
@@ -163,7 +163,7 @@ class Listing:
         """
         origin, poses = origin_near(source, poses[:, :3, 3], movable), poses.copy()
         poses[:, :3, 3] -= origin
-        refuse_repeats(labels, paths, poses, times)
+        _refuse_repeats(labels, paths, poses, times)
         listing = cls(
             paths=tuple(paths),
             camera_to_world=torch.from_numpy(poses).float(),
@@ -307,6 +307,27 @@ def _without_ignored(listing: Listing, rest: Sequence[int]) -> Listing:
     return listing.subset(rest)
 
 
+def _refuse_repeats(
+    labels: Sequence[str], paths: Sequence[Path], poses: np.ndarray, times: Sequence[float]
+) -> None:
+    """Refuse files, and pairs of camera and time in a dynamic scene, that are listed twice."""
+    seen: dict[Any, str] = {}
+    moving = len(set(times)) > 1
+    for index, label in enumerate(labels):
+        other = seen.setdefault(paths[index], label)
+        if other is not label:
+            raise SceneError(f"{label} has the same file as {other}. Remove one of the two.")
+        # In a static scene, a camera may pass the same place twice.
+        if not moving:
+            continue
+        other = seen.setdefault((poses[index].tobytes(), times[index]), label)
+        if other is not label:
+            raise SceneError(
+                f"{label} has the same camera and time as {other}. Remove one of the two, or "
+                f"correct its time."
+            )
+
+
 def _require_shapes(listing: Listing) -> None:
     """Refuse images whose aspect ratio differs from their camera's, and masks of other sizes."""
     sizes = native_sizes(listing.paths)
@@ -387,8 +408,7 @@ def final_intrinsics(
     focal, centre, skew = (
         torch.tensor(values, dtype=torch.float64) for values in zip(*known, strict=True)
     )
-    pad = (0.0,) * len(COEFFICIENTS)
-    rows = [(c.distortion + pad)[: len(COEFFICIENTS)] for c in calibrations]
+    rows = [[each.distortion.get(name, 0.0) for name in COEFFICIENTS] for each in calibrations]
     model = torch.tensor([int(calibration.model) for calibration in calibrations])
     lenses = Lenses(model, torch.tensor(rows, dtype=torch.float64), skew)
     intrinsics = Intrinsics(focal, centre, torch.tensor(sizes), lenses)
@@ -420,7 +440,7 @@ def _require_real(
             f"{label}: the skew is {skew:.3g} pixels, more than the focal length of "
             f"{focal[0]:.3g}. Correct the camera, or calibrate again."
         )
-    if any(not abs(value) <= STRONGEST for value in camera.distortion):
+    if any(not abs(value) <= STRONGEST for value in camera.distortion.values()):
         raise SceneError(
             f"{label}: its {camera.description}; no coefficient may exceed {STRONGEST:g}. Correct "
             "the camera, or calibrate again."

@@ -224,10 +224,7 @@ class _Frame(NamedTuple):
 
 
 def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame]:
-    """Usable frames; warns about those without image, finite pose, or time if most have one.
-
-    A frame that is listed again, equal in all its keys, is left out, too.
-    """
+    """Frames, but for repeated ones and those without image, finite pose, or time if most have."""
     entries = content["frames"]
     key = _time_key(entries)
     timed = sum(entry.get(key) is not None for entry in entries)
@@ -429,11 +426,7 @@ def _has_content(value: Any) -> bool:
 
 
 def _standard(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
-    """The keys in standard form: strings as values, and alternative intrinsics by standard keys.
-
-    Fields of view are converted to radians. instant-ngp's x_fov, which takes precedence over focal
-    lengths, and its converter's fovx are in degrees.
-    """
+    """The keys in standard form: strings as values, and alternative intrinsics by standard keys."""
     found = dict(keys)
     for key in {*ALIASES} & {*keys}:
         if is_positive(number_in(str(keys[key]))):
@@ -453,6 +446,7 @@ def _standard(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
             (fl_x, _, cx), (_, fl_y, cy) = matrix[:2, :3].tolist()
             found = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy} | found
             del found[key]  # Other values get the warning about unknown keys.
+    # instant-ngp's x_fov precedes focal lengths; it and its converter's fovx are in degrees.
     for axis in "xy":
         angle, name = found.get(f"{axis}_fov"), f"camera_angle_{axis}"
         if is_positive(angle):

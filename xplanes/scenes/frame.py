@@ -262,15 +262,9 @@ def pixels_across(views: Views, frame: Frame) -> float:
 
 
 def _middle_box(views: Views, points: Tensor, centre: Tensor) -> Tensor | None:
-    """The box, with a margin, of points that most cameras see in the middle of their images.
+    """The corners of a box around points that most cameras see in the middle. [2, 3]
 
-    Args:
-        views: Training views.
-        points: World points. [N, 3]
-        centre: Point at which the cameras look; the box must contain it if their axes meet. [3]
-
-    Returns:
-        Lower and upper corner; None if there is no such box. [2, 3]
+    None if there is no such box. It must contain ``centre`` if the cameras' axes meet there.
     """
     points = points[points.isfinite().all(dim=1)]
     points = points[:: -(-len(points) // MOST_POINTS) or 1]

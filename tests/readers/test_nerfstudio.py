@@ -400,13 +400,17 @@ def test_alpha_beside_images_is_read(capture, name):
 
 
 @pytest.mark.parametrize(
-    "lost", ["in another folder", "a link to nothing", "one of several", "in a list", "a mask"]
+    "lost",
+    ["in another folder", "a link to nothing", "one of several", "in a list", "a mask", "", None],
 )
 def test_a_frame_without_its_image_or_its_mask_is_left_out(capture, lost):
     path, words = capture.image(3), "no image"
     with Image.open(path) as picture:
         pixels = picture.copy()
-    if lost == "in another folder":
+    if not lost:  # The name itself.
+        capture.change(3, file_path=lost)
+        words = f"file_path is {lost!r}"
+    elif lost == "in another folder":
         (capture.path / "right").mkdir()
         capture.change(3, file_path=f"right/{path.name}")
     elif lost == "a mask":  # Which is not the image itself.
@@ -761,13 +765,6 @@ def test_principal_points_in_other_units_are_told_of(capture, keys):
         capture.train()
     capture.change(fl_x=FOCAL / SIZE**2, fl_y=FOCAL / SIZE**2)
     capture.refused("the focal length along x is .* must lie between 0.02")
-
-
-@pytest.mark.parametrize("name", ["", None])
-def test_frames_without_a_name_are_left_out(capture, name):
-    capture.change(3, file_path=name)
-    with told(f"1 of 10 frames are left out:\n.*frame 3 .*file_path is {name!r}"):
-        assert len(capture.all()) == 9
 
 
 @pytest.mark.parametrize("ending", [".png", ""])

@@ -175,11 +175,12 @@ class CaptureSettings(SceneSettings, ABC):
             warn_of_masks(self.folder, listing.paths)
         warn_of_videos(self.folder, listing.paths)
         turn, words = world_turn(listing.camera_to_world, listing.paths, self.orient, up)
-        found = None if points is None else torch.from_numpy(points - np.array(listing.origin))
+        found = None
+        if points is not None:
+            found = torch.from_numpy(points - np.array(listing.origin))
+            found = (found if turn is None else found @ turn.T).float()
         if turn is not None:
             listing = listing.turned(turn)
-            found = None if found is None else found @ turn.T
         parts = self.thinned({split: listing.subset(places[split]) for split in splits})
-        found = None if found is None else found.float()
         masks = listing.masks, listing.mask_meaning
         return scene_of(self, parts, self.mask_use, masks, words, points=found)

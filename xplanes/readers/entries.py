@@ -58,13 +58,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
     encoding of accents, as long as only one file matches; it may be percent-encoded. If there is no
     such path, its first folders are dropped one by one, as it may be a path of another machine.
     Relative names keep the folder of a split, and all folders if the last one exists. A name
-    without folders is also looked up in the folder ``images``.
-
-    Args:
-        label: The file and frame that name it, for messages.
-        folder: The scene's folder.
-        name: Name relative to ``folder``, or an absolute path into it.
-        key: The key of the name.
+    without folders is also looked up in the folder ``images``. ``label``, the file and frame that
+    name it, and ``key`` are for messages.
 
     Raises:
         BrokenFrameError: If there is no such file, or it is empty.
@@ -93,12 +88,7 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
 
 
 def usable(what: str, read: Callable[[Item], Found], items: Sequence[Item]) -> list[Found]:
-    """Results of a function for usable frames; warns about the others.
-
-    Args:
-        what: Name of the frames, for the warning.
-        read: The function; raises `BrokenFrameError` for a frame that is to be left out.
-        items: The frames.
+    """Results of a function for frames; warns about those for which it raises `BrokenFrameError`.
 
     Raises:
         MissingSplitError: If all frames are left out.
@@ -171,14 +161,8 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
     """Paths that a name may refer to inside ``folder``, unchanged and with image suffixes.
 
     Links are followed, even out of the folder; ``..`` must not leave it, unless nothing is there
-    and the rest of the name leads to a file inside.
-
-    Args:
-        label: The file and frame that name it, for messages.
-        folder: The scene's folder.
-        name: Name relative to ``folder``, or an absolute path.
-        key: The key of the name.
-        example: A valid name, for messages.
+    and the rest of the name leads to a file inside. Arguments are those of `image_path`, and a
+    valid name for messages.
 
     Raises:
         BrokenFrameError: If it is empty or null.
@@ -268,11 +252,7 @@ def unit_times(times: Sequence[float], span: tuple[float, float] | None = None) 
 
 
 def read_object(path: Path, content: str) -> dict[str, Any]:
-    """A JSON object from a file.
-
-    Args:
-        path: The file.
-        content: Required content, for messages.
+    """A JSON object, whose content is described for messages, from a file.
 
     Raises:
         SceneError: If it cannot be read, or is not an object.
@@ -315,13 +295,9 @@ def decoded(content: bytes) -> str:
 def reading(path: Path, how: str = "", advice: str = "") -> Iterator[None]:
     """Refuse a file that was not fetched, such as a pointer of Git LFS, or that cannot be read.
 
-    Args:
-        path: The file that is read in the block.
-        how: How it is read, such as "as JSON", for the message.
-        advice: Further text of the message.
-
     Raises:
-        SceneError: With the kind of placeholder, or the problem in the block.
+        SceneError: With the kind of placeholder, or the problem in the block, how the file is read
+            there, such as "as JSON", and advice.
     """
     if (other := stand_in(path)) is not None:
         raise SceneError(f"{path} {other}.")
@@ -335,12 +311,7 @@ def reading(path: Path, how: str = "", advice: str = "") -> Iterator[None]:
 
 
 def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.ndarray:
-    """A camera-to-world matrix: finite, rigid, right-handed.
-
-    Args:
-        label: Its file and frame, for messages.
-        matrix: 4 rows of 4 numbers; the last row may be missing.
-        key: Its key there.
+    """A camera-to-world matrix: finite, rigid, right-handed; its last row may be missing.
 
     Returns:
         The matrix. float64 [4, 4]

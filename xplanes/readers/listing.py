@@ -199,13 +199,7 @@ class Listing:
 
 
 def time_source(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
-    """Description of the times' source, with examples.
-
-    Args:
-        origin: The source.
-        files: Names of the images. [V]
-        times: Their times as given. [V]
-    """
+    """Description of the times' source, with examples: files and times as given. [V], [V]"""
     low, high = min(times), max(times)
     # Six digits of what differs, as clocks count from 1970.
     largest = max(abs(low), abs(high))
@@ -347,13 +341,7 @@ def _require_shapes(listing: Listing) -> None:
 
 
 def misshapen(path: Path, size: Size, camera: Calibration) -> str | None:
-    """An error message if the size of an image or video contradicts its calibration; else None.
-
-    Args:
-        path: The file.
-        size: Its height and width.
-        camera: Its calibration.
-    """
+    """An error message if the size of an image or video contradicts its calibration; else None."""
     if camera.w is None or camera.h is None:
         return None
     height, width = size
@@ -469,10 +457,7 @@ def _warn_of_other_units(
 def _require_rays(
     labels: Sequence[str], cameras: Sequence[Calibration], intrinsics: Intrinsics
 ) -> None:
-    """Refuse images where most pixels of a perspective lens, or all pixels of another, lack rays.
-
-    Fewer such pixels of a perspective lens are left out, with a warning.
-    """
+    """Refuse images where most pixels of a perspective lens, or all of another, lack rays."""
     problems: list[str] = []
     folded: list[tuple[float, str]] = []
     for index, (label, lens) in enumerate(zip(labels, cameras, strict=True)):

@@ -275,11 +275,7 @@ def _from_poses_bounds(folder: Path) -> list[Camera]:
 
 
 def read_poses_bounds(path: Path, sources: Sequence[Path]) -> list[Camera]:
-    """The camera of each row of poses_bounds.npy.
-
-    Args:
-        path: The file.
-        sources: Images, videos or folders of the rows, in order.
+    """The cameras of poses_bounds.npy, whose rows are of images, videos or folders in this order.
 
     Raises:
         SceneError: If it cannot be read, or has another number of rows.

@@ -122,9 +122,6 @@ def numbers(contents: Mapping[Path, Mapping[str, Any]]) -> dict[str, float]:
 
     Images that are missing do not count: programs list cameras that were never rendered. Empty if
     a frame has a time, or if names have no number that varies.
-
-    Args:
-        contents: Result of `readable`.
     """
     images: dict[str, str] = {}
     for path, content in contents.items():
@@ -140,14 +137,7 @@ def numbers(contents: Mapping[Path, Mapping[str, Any]]) -> dict[str, float]:
 
 
 def all_masks(contents: Mapping[Path, Mapping[str, Any]]) -> tuple[list[Path | None], str]:
-    """Masks of the usable images in several transforms files, and their meaning.
-
-    Args:
-        contents: Result of `readable`.
-
-    Returns:
-        As ``masks`` and ``mask_meaning`` of `Listing`.
-    """
+    """``masks`` and ``mask_meaning``, as of `Listing`, of the usable images in several files."""
     masks, meaning = [], ""
     for path, content in contents.items():
         pairs = []

@@ -17,6 +17,7 @@ from xplanes.readers.images import GREY
 from xplanes.readers.listing import Listing, read_views
 from xplanes.readers.masks import MASKS, MaskUse, chosen_use, survey
 from xplanes.readers.videos import SUFFIXES as VIDEOS
+from xplanes.readers.videos import is_video
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
 from xplanes.settings import Count
@@ -25,10 +26,7 @@ from xplanes.settings import Count
 def warn_of_masks(folder: Path, images: Sequence[Path], advice: str = "") -> None:
     """Warn about files and folders that seem to be masks, but are not read.
 
-    Args:
-        folder: The scene's folder.
-        images: Its images, without masks.
-        advice: What to do with masks; empty if they can be named.
+    Advice is empty if they can be named.
     """
     folder, images = folder.resolve(), [path.resolve() for path in images]
     places = {path.parent for path in images}
@@ -53,8 +51,7 @@ def warn_of_masks(folder: Path, images: Sequence[Path], advice: str = "") -> Non
 
 def warn_of_videos(folder: Path, images: Sequence[Path]) -> None:
     """Warn about several videos in a capture's folder, or in one inside, but for its images."""
-    inside = [path for pattern in ("*", "*/*") for path in folder.glob(pattern)]
-    inside = [path for path in inside if path.suffix.lower() in VIDEOS and path.name[0] != "."]
+    inside = [*filter(is_video, [*folder.glob("*"), *folder.glob("*/*")])]
     found = sorted(path.name for path in inside)
     if len(found) > 1:
         alike = {path.stem for path in images} <= {path.stem for path in inside}

@@ -142,10 +142,9 @@ class ColmapSettings(CaptureSettings):
             name = model.names[place]
             return place, image_path(f"{model.source}: {name}", root, name, "NAME")
 
-        places = range(len(model.names))
-        kept, paths = zip(*usable("images", image_of, places), strict=True)
-        model = model.subset(kept)
-        labels = [f"{model.source}: {name}" for name in model.names]
+        kept, paths = zip(*usable("images", image_of, range(len(model.names))), strict=True)
+        names = tuple(model.names[place] for place in kept)
+        labels = [f"{model.source}: {name}" for name in names]
         # The search does not enter folders that are links.
         found = {*root.rglob("*")}.union(*(place.iterdir() for place in {p.parent for p in paths}))
         present = {
@@ -157,18 +156,18 @@ class ColmapSettings(CaptureSettings):
                 "%d of %d images in %s are not used, because COLMAP did not register them: %s",
                 *(len(rest), len(present), images, some(rest)),
             )
-        times, source = self._times(model.names, labels, used, present)
+        times, source = self._times(names, labels, used, present)
         return Listing.checked(
             model.source,
             labels,
             paths,
-            model.camera_to_world,
+            model.camera_to_world[[*kept]],
             times,
             files=tuple((_shown(images, self.folder) / name).as_posix() for name in used),
-            calibrations=model.calibrations,
-            masks=() if self.masks is None else self._masks(model.names, self.masks),
+            calibrations=tuple(model.calibrations[place] for place in kept),
+            masks=() if self.masks is None else self._masks(names, self.masks),
             time_source=source,
-            names=model.names,
+            names=names,
         )
 
     def _masks(self, names: Sequence[str], masks: str) -> tuple[Path | None, ...]:

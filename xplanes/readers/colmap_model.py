@@ -10,7 +10,7 @@ import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -90,15 +90,6 @@ class SparseModel:
     calibrations: tuple[Calibration, ...]
     points: np.ndarray | None
     error: float = math.nan
-
-    def subset(self, places: Sequence[int]) -> "SparseModel":
-        """The images at ``places``, in that order, and all points."""
-        return replace(
-            self,
-            names=tuple(self.names[place] for place in places),
-            camera_to_world=self.camera_to_world[list(places)],
-            calibrations=tuple(self.calibrations[place] for place in places),
-        )
 
 
 def find_model(folder: Path, names: Sequence[str] = MODELS) -> Path | None:

@@ -374,13 +374,8 @@ def final_intrinsics(
     """Intrinsics of images in their final sizes.
 
     Warns about perspective lenses that map no direction to some of the pixels, and about principal
-    points far from the middle.
-
-    Args:
-        labels: The images, for messages. [V]
-        calibrations: Their calibrations. [V]
-        native: Heights and widths of the files. [V]
-        sizes: Final heights and widths. [V]
+    points far from the middle. Labels, calibrations, and sizes of the files and in the end are
+    those of the images. [V]
 
     Raises:
         SceneError: If a camera's intrinsics are implausible, or if most pixels of a perspective

@@ -149,13 +149,9 @@ def _has_regions(grey: np.ndarray) -> bool:
 
 
 def chosen_use(use: MaskUse, kind: MaskKind, where: str, told: str = "") -> tuple[MaskUse, str]:
-    """The use of a capture's masks, and a description; warns if it is ambiguous.
+    """The use of a capture's masks by ``data.mask_use``, and a description; warns if ambiguous.
 
-    Args:
-        use: The setting ``data.mask_use``.
-        kind: Result of `survey`.
-        where: Source of the masks, for messages.
-        told: Meaning as defined by their source, "alpha" or "ignored"; empty if undefined.
+    ``told`` is their meaning as defined by their source, "alpha" or "ignored", or empty.
     """
     if use == "lrm":
         return use, "for LRMs alone (data.mask_use=lrm)"
@@ -185,13 +181,8 @@ def read_mask(path: Path, kind: MaskKind, image: Path | None = None) -> np.ndarr
 
     Masks with transparency are read from alpha; in coloured masks only black is masked out.
 
-    Args:
-        path: The file.
-        kind: Meaning of the capture's masks.
-        image: The image whose size the mask must have; None for any size.
-
     Raises:
-        SceneError: If it cannot be decoded, or has another size.
+        SceneError: If it cannot be decoded, or has another size than its image, if that is given.
     """
     grey, _ = _stored(path)
     if image is not None and grey.shape != (wanted := read_header(image)[0]):
@@ -212,13 +203,7 @@ def ignored_pixels(
     sizes: Sequence[tuple[int, int]],
     kind: MaskKind,
 ) -> Tensor:
-    """Pixels of reduced images whose mask coverage is below `KEPT`, padded. bool [V, H, W]
-
-    Args:
-        masks: A file for each image, or None. [V]
-        images: The images. [V]
-        sizes: Their heights and widths. [V]
-        kind: As for `read_mask`.
+    """Pixels of images, reduced to sizes, with mask coverage below `KEPT`, padded. bool [V, H, W]
 
     Raises:
         SceneError: If a mask cannot be decoded, or has another size than its image.

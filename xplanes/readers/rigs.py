@@ -213,7 +213,7 @@ def recordings_below(folder: Path, *others: str) -> list[Path]:
 def recordings_of_rows(folder: Path) -> list[Path]:
     """Recordings with rows in poses_bounds.npy: of any name if there are only videos."""
     inside = sorted(path for path in folder.iterdir() if path.name[0] != ".")
-    loose = _colours([path for path in inside if path.suffix.lower() in videos.SUFFIXES])
+    loose = _colours([*filter(videos.is_video, inside)])
     images = any(path.name.startswith("images") or path.name.lower() in IMAGES for path in inside)
     return recordings_below(folder) or ([] if images or len(loose) < 2 else loose)
 
@@ -256,7 +256,7 @@ def _is_filled(path: Path) -> bool:
 
 
 def _is_recording(path: Path) -> bool:
-    return path.name[0] != "." and (path.is_dir() or path.suffix.lower() in videos.SUFFIXES)
+    return videos.is_video(path) or (path.is_dir() and path.name[0] != ".")
 
 
 def _from_poses_bounds(folder: Path) -> list[Camera]:
@@ -478,12 +478,8 @@ def _videos_by_name(folder: Path) -> dict[str, Path]:
     """Videos in a folder, or else in one inside that is not of masks, by name without ending."""
     folder = folder.resolve()
     inside = [p for p in sorted(folder.glob("*/*")) if not OTHER_KINDS.search(p.parent.name)]
-    found = [*inside, *sorted(folder.glob("*"))]
-    return {
-        path.stem: path
-        for path in found
-        if path.suffix.lower() in videos.SUFFIXES and not path.name.startswith(".")
-    }
+    found = filter(videos.is_video, [*inside, *sorted(folder.glob("*"))])
+    return {path.stem: path for path in found}
 
 
 def _source(label: str, folder: Path, name: Any, named: Mapping[str, Path]) -> Path:
@@ -510,10 +506,10 @@ def with_frames(source: Path) -> Path:
     """A camera's source, or the only video in its folder if no images lie beside it."""
     if source.is_file():
         return source
-    inside = [path for path in source.iterdir() if path.is_file() and path.name[0] != "."]
+    inside = [*filter(Path.is_file, source.iterdir())]
     if any(map(is_image, inside)):
         return source
-    found = [path for path in inside if path.suffix.lower() in videos.SUFFIXES]
+    found = [*filter(videos.is_video, inside)]
     return found[0] if len(found) == 1 else source
 
 

@@ -15,7 +15,7 @@ from xplanes.readers.entries import world_turn
 from xplanes.readers.formats import is_image
 from xplanes.readers.images import GREY
 from xplanes.readers.listing import Listing, read_views
-from xplanes.readers.masks import MASKS, MaskUse, chosen_use, survey
+from xplanes.readers.masks import MASKS, MaskUse, Meaning, chosen_use, survey
 from xplanes.readers.videos import SUFFIXES as VIDEOS
 from xplanes.readers.videos import is_video
 from xplanes.scenes.source import SceneSettings
@@ -66,7 +66,7 @@ def scene_of(
     settings: SceneSettings,
     parts: Mapping[str, Listing],
     mask_use: MaskUse,
-    masks: tuple[Sequence[Path | None], str],
+    masks: tuple[Sequence[Path | None], Meaning | None],
     up: str = "",
     video: Listing | None = None,
     points: Tensor | None = None,
@@ -95,7 +95,7 @@ def scene_of(
             "data.mask_use=lrm: no training image has a mask file. Add masks, or set it to auto."
         )
     if any(files):
-        kind = survey(files, told == "ignored")
+        kind = survey(files, told == "ignore")
         use, notes["masks"] = chosen_use(mask_use, kind, str(settings.folder), told)
 
     def read(part: Listing) -> Views:

@@ -14,7 +14,7 @@ from xplanes.errors import MissingSplitError, SceneError, refuse_all, some, warn
 from xplanes.readers.entries import origin_near
 from xplanes.readers.formats import UNTURN, mask_misfit, orientation
 from xplanes.readers.images import GREY, Picture, Size, final_sizes, native_sizes, read_images
-from xplanes.readers.masks import MaskKind, ignored_pixels
+from xplanes.readers.masks import MaskKind, Meaning, ignored_pixels
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.source import held_out_places
 from xplanes.scenes.views import Intrinsics, Views, spread
@@ -110,8 +110,7 @@ class Listing:
         calibrations: Focal length, principal point and lens of each image. [V]
         masks: A mask file for each image, white where it shows the scene and black elsewhere, or
             None for an image without; empty if there are none. [V]
-        mask_meaning: Meaning of masks as defined by the source: "alpha", or "ignored" (white where
-            pixels are to be ignored); empty if it does not define it.
+        mask_meaning: Meaning of masks as defined by the source; None if it does not define it.
         clear: Grey levels, out of 255, that are transparent in its images.
         time_source: Source of the times, with examples; empty if there are no times.
         names: Their names in the file of the cameras; empty if nothing else refers to them. [V]
@@ -124,7 +123,7 @@ class Listing:
     times: Tensor
     calibrations: tuple[Calibration, ...]
     masks: tuple[Path | None, ...] = ()
-    mask_meaning: str = ""
+    mask_meaning: Meaning | None = None
     clear: tuple[int, ...] = ()
     time_source: str = ""
     names: tuple[str, ...] = ()

@@ -24,6 +24,9 @@ alpha: empty space; ignore: pixels to ignore; lrm: removed only from the LRM's i
 space if masks look like silhouettes, else pixels to ignore.
 """
 
+Meaning = Literal["alpha", "ignore"]
+"""Meaning of masks by their source or look; a source's own to ignore are white, not black."""
+
 MASKS = re.compile(r"(?i)mask|(?<![a-z])mattes?(?![a-z])|silhouette")
 """Part of the names of masks."""
 
@@ -84,7 +87,7 @@ class MaskKind:
     equal: bool = False
 
     @property
-    def use(self) -> Literal["alpha", "ignore"]:
+    def use(self) -> Meaning:
         """Meaning of the black parts: empty if the masks are silhouettes, else to be ignored."""
         return "alpha" if self.edge >= SILHOUETTE_EDGE and not self.shared else "ignore"
 
@@ -148,17 +151,13 @@ def _has_regions(grey: np.ndarray) -> bool:
     return not above.any() or any(len(same) and same.mean() >= RUNS for same in (across, down))
 
 
-def chosen_use(use: MaskUse, kind: MaskKind, where: str, told: str = "") -> tuple[MaskUse, str]:
-    """The use of a capture's masks by ``data.mask_use``, and a description; warns if ambiguous.
-
-    ``told`` is their meaning as defined by their source, "alpha" or "ignored", or empty.
-    """
+def chosen_use(
+    use: MaskUse, kind: MaskKind, where: str, told: Meaning | None
+) -> tuple[MaskUse, str]:
+    """The use of a capture's masks by ``data.mask_use``, and a description; warns if ambiguous."""
     if use == "lrm":
         return use, "for LRMs alone (data.mask_use=lrm)"
-    found: MaskUse = use
-    if use == "auto":
-        known: dict[str, MaskUse] = {"alpha": "alpha", "ignored": "ignore"}
-        found = known.get(told, kind.use)
+    found: MaskUse = (told or kind.use) if use == "auto" else use
     meaning = {
         "alpha": "silhouettes: what they leave out is empty",
         "ignore": "pixels to ignore: what they leave out is neither trained on nor scored",

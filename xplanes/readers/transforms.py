@@ -29,6 +29,7 @@ from xplanes.readers.entries import (
 )
 from xplanes.readers.formats import read_header
 from xplanes.readers.listing import Calibration, Listing, time_source
+from xplanes.readers.masks import Meaning
 from xplanes.readers.name_times import times_in_names
 from xplanes.readers.transforms_lenses import OTHER_LENSES, PIXELS, read_calibration
 from xplanes.scenes.cameras import focal_length
@@ -94,11 +95,14 @@ TIMELESS = (
 )
 """How to give other times than the numbers in names."""
 
-BESIDE = {
-    "ignored": ["dynamic_mask_{stem}.png"],
+BESIDE: dict[Meaning, list[str]] = {
+    "ignore": ["dynamic_mask_{stem}.png"],
     "alpha": ["{stem}.alpha{suffix}", "{stem}{suffix}.alpha{suffix}"],
 }
 """Names of mask files beside an image, by their meaning."""
+
+Masks = tuple[list[Path | None], Meaning | None]
+"""A mask file for each image, or none, and their meaning if the source defines it."""
 
 
 def readable(paths: Sequence[Path]) -> dict[Path, dict[str, Any]]:
@@ -136,9 +140,9 @@ def numbers(contents: Mapping[Path, Mapping[str, Any]]) -> dict[str, float]:
     return dict(zip(images, found, strict=True)) if found else {}
 
 
-def all_masks(contents: Mapping[Path, Mapping[str, Any]]) -> tuple[list[Path | None], str]:
+def all_masks(contents: Mapping[Path, Mapping[str, Any]]) -> Masks:
     """``masks`` and ``mask_meaning``, as of `Listing`, of the usable images in several files."""
-    masks, meaning = [], ""
+    masks, meaning = [], None
     for path, content in contents.items():
         pairs = []
         for entry in content["frames"]:
@@ -302,10 +306,10 @@ def _warn_of_selection(path: Path, content: Mapping[str, Any]) -> None:
         )
 
 
-def _masks(pairs: Sequence[tuple[Path, Path | None]]) -> tuple[list[Path | None], str]:
+def _masks(pairs: Sequence[tuple[Path, Path | None]]) -> Masks:
     """Masks of images, or else those beside them with instant-ngp's names, and their meaning."""
     if any(mask for _, mask in pairs):
-        return [mask for _, mask in pairs], ""
+        return [mask for _, mask in pairs], None
     for meaning, patterns in BESIDE.items():
         found = [
             next((mask for name in names if (mask := path.with_name(name)).is_file()), None)
@@ -314,7 +318,7 @@ def _masks(pairs: Sequence[tuple[Path, Path | None]]) -> tuple[list[Path | None]
         ]
         if any(found):
             return found, meaning
-    return [], ""
+    return [], None
 
 
 def _warn_of_rays(path: Path, images: Sequence[Path]) -> None:

@@ -278,14 +278,13 @@ class RayBatches(Batches):
         uniform_far, uniform_textureless = self.far_pixels / pixels, textureless_pixels / pixels
         skip = settings.skip_background and self.near_pixels > 0
         share = settings.background_share if changes is None else STATIC_SHARE
-        self.far_share = min(share, uniform_far) if skip else uniform_far
-        self.textureless_share = (
-            min(TEXTURELESS_SHARE, uniform_textureless) if skip else uniform_textureless
-        )
+        most_far, most_textureless = (share, TEXTURELESS_SHARE) if skip else (1.0, 1.0)
+        self.far_share = min(most_far, uniform_far)
+        textureless_share = min(most_textureless, uniform_textureless)
         jitter = skip and uniform_far > 0 and not views.is_static and changes is None
         self.background_jitter = settings.background_jitter if jitter else 0.0
-        self.skipped = uniform_far + uniform_textureless - self.far_share - self.textureless_share
-        self.pools.share(self.far_share, self.textureless_share)
+        self.skipped = uniform_far + uniform_textureless - self.far_share - textureless_share
+        self.pools.share(self.far_share, textureless_share)
 
     def add_slopes(self) -> None:
         if isinstance(self.views.images, StoredImages):

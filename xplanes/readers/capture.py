@@ -73,15 +73,9 @@ def scene_of(
 ) -> Scene:
     """The scene of listed images, which are decoded here.
 
-    Args:
-        settings: Settings with its folder and the width of its images.
-        parts: The images of each split.
-        mask_use: Meaning of the black parts of masks.
-        masks: Masks of the whole capture, from which their meaning is determined for all
-            splits, and what their source says of it, as in `Listing`.
-        up: Description of the up direction; empty if the files' world is unchanged.
-        video: Frames of a fixed camera, if there are some.
-        points: World points on surfaces, if known. [N, 3]
+    ``masks`` are those of the whole capture, from which their meaning is determined for all splits,
+    and what their source says of it, as in `Listing`. ``up`` describes the up direction, and is
+    empty if the files' world is unchanged.
 
     Raises:
         SceneError: If an image or a mask cannot be used, or with mask_use lrm if no training
@@ -146,15 +140,9 @@ class CaptureSettings(SceneSettings, ABC):
         points: np.ndarray | None = None,
         up: Tensor | None = None,
     ) -> Scene:
-        """The requested splits of a capture.
+        """The requested splits of a capture, from indices of each split's images in the list.
 
-        Args:
-            listing: All images.
-            places: Indices of each split's images in the list.
-            splits: Names of splits.
-            source: Source of the splits, for messages.
-            points: World points on surfaces. [N, 3]
-            up: The world's up vector, if the files give one. float64 [3]
+        ``points`` are on surfaces, in the world, [N, 3]; ``up`` is its up vector in the files.
 
         Raises:
             MissingSplitError: If a split has no images.

@@ -208,11 +208,9 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
 
 
 def mask_files(folder: Path, names: Sequence[Sequence[str]]) -> tuple[Path | None, ...]:
-    """The mask of each image; None for images without a mask.
+    """The mask of each image, by its possible names without the ending in order of preference.
 
-    Args:
-        folder: Folder of masks.
-        names: Possible names of each image's mask without the ending, in order of preference. [V]
+    None for images without a mask. [V]
 
     Raises:
         SceneError: If no image has a mask.
@@ -415,17 +413,10 @@ def origin_near(source: Path, positions: np.ndarray, movable: bool = True) -> np
     """A point relative to which single precision resolves the cameras: if possible, the origin.
 
     Captures in map coordinates lie millions of metres away, where numbers are half a metre apart.
-
-    Args:
-        source: File of the cameras, for messages.
-        positions: Positions of all cameras of a capture. float64 [V, 3]
-        movable: Whether it may be another point than the origin.
-
-    Returns:
-        float64 [3]
+    float64 [V, 3] -> float64 [3]
 
     Raises:
-        SceneError: If there is no such point.
+        SceneError: If there is no such point, or it is not the origin and may not be moved.
     """
     extent = float(np.ptp(positions, axis=0).max())
     fixed = extent <= SAME_PLACE

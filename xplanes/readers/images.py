@@ -131,11 +131,8 @@ def read_images(
 ) -> Tensor | store.StoredImages:
     """Decode images of any sizes and reduce them.
 
-    Images that take more than `store.IN_MEMORY` bytes are decoded once to a file in the cache.
-
-    Args:
-        pictures: At least one, with one kind of masks and the same transparent levels. [V]
-        cache: Folder of decoded images; the user's cache when None.
+    Images that take more than `store.IN_MEMORY` bytes are decoded once to a file in the cache, the
+    user's when None. All have one kind of masks and the same transparent levels. [V]
 
     Returns:
         The images of `Picture.decoded`, padded with zeros at the bottom and on the right.

@@ -145,16 +145,9 @@ class Listing:
     ) -> "Listing":
         """A list of images that has passed the checks common to all formats.
 
-        Warns about images without a mask among others that have one.
-
-        Args:
-            source: File of the cameras, for messages.
-            labels: The file and frame of each image, for messages. [V]
-            paths: Image files. [V]
-            poses: Camera-to-world matrices with OpenGL's axes. float64 [V, 4, 4]
-            times: From 0 to 1; empty for a static scene. [V]
-            movable: Whether the poses may get another origin, if the files' is too far away.
-            **more: Further attributes.
+        Warns about images without a mask among others that have one. The file of the cameras, and
+        labels of the images, are for messages. Poses are float64, may be read relative to another
+        origin if ``movable``, and no times mean a static scene; ``more`` are further attributes.
 
         Raises:
             SceneError: If cameras are too far away, an image is listed twice, or the sizes of files

@@ -102,11 +102,7 @@ class MaskKind:
 
 
 def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
-    """Determine the meaning of a capture's masks from a sample of them.
-
-    Args:
-        masks: A file for each image, or None. [V]
-        inverted: Whether white pixels are masked out.
+    """Determine the meaning of a capture's masks, of which white pixels may be masked out. [V]
 
     Raises:
         SceneError: If a mask cannot be decoded.

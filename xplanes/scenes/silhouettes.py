@@ -38,15 +38,9 @@ MOST_VIEWS = 5
 """Most views in the window: more would cut off moving content and carve away little else."""
 
 
-def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
-    """Pixels within ``margin`` pixels of the silhouettes. bool [V, H, W]
-
-    Args:
-        views: Images; their padding is never foreground.
-        margin: One for all images, or one for each.
-    """
+def foreground(views: Views, margins: Sequence[int]) -> Tensor:
+    """Pixels within each image's margin of its silhouette, but for padding. bool [V, H, W]"""
     near = torch.zeros(views.images.shape[:3], dtype=torch.bool)
-    margins = [margin] * len(views) if isinstance(margin, int) else margin
     for index, reach in enumerate(margins):
         shown = views.silhouette(index)
         near[index, : shown.shape[0], : shown.shape[1]] = widened(shown, reach)

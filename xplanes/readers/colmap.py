@@ -184,22 +184,18 @@ class ColmapSettings(CaptureSettings):
         """Times from 0 to 1, and their source; no times if the scene is static."""
         if self.static:
             return [], ""
-        if self.times is None:
-            pattern = self.time_pattern
-            if (self.static, pattern) == (None, None) and self._as_llff:
-                return [], STATIC
-            if pattern is not None:
-                found = _matched(names, labels, pattern)
-            elif not (found := times_in_names(names, dynamic=self.static is False)):
-                return [], ""
-            origin = "the numbers in their names"
-        elif self.times == "rank":
-            found = _ranks(used, present)
-            origin = "their order in their folders"
-        else:
+        origin = "the numbers in their names"
+        if self.times == "rank":
+            found, origin = _ranks(used, present), "their order in their folders"
+        elif self.times is not None:
             path = self.folder / self.times
-            found = _listed_times(path, names)
-            origin = str(path)
+            found, origin = _listed_times(path, names), str(path)
+        elif self.time_pattern is not None:
+            found = _matched(names, labels, self.time_pattern)
+        elif self.static is None and self._as_llff:
+            return [], STATIC
+        elif not (found := times_in_names(names, dynamic=self.static is False)):
+            return [], ""
         logger.info(
             "The times of %d images, from 0 to 1, are %s, from %s to %s",
             *(len(names), origin, min(found), max(found)),

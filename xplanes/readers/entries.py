@@ -1,5 +1,6 @@
 """Reading and checking of names, poses, numbers and times in camera files."""
 
+import itertools
 import json
 import logging
 import math
@@ -67,10 +68,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
     """
     choices = [*paths_inside(label, folder, name, key, "./train/r_000")]
     choices += [folder / "images" / path.name for path in choices if path.parent == folder]
-    image = next(filter(Path.is_file, choices), None)
-    if image is None:
-        image = next(filter(None, map(_similar, choices)), None)
-    if image is not None:
+    found = itertools.chain(filter(Path.is_file, choices), filter(None, map(_similar, choices)))
+    if (image := next(found, None)) is not None:
         if image.stat().st_size == 0:
             raise BrokenFrameError(f"{label}: {image} holds 0 bytes. Copy the file again.")
         return image

@@ -113,9 +113,8 @@ def final_sizes(
     """
     if resolution is None:
         return list(native)
-    narrow = [(width, path) for path, (_, width) in zip(paths, native, strict=True)]
-    narrow = [(width, path) for width, path in narrow if width < resolution]
-    if narrow:
+    pairs = zip(paths, native, strict=True)
+    if narrow := [(width, path) for path, (_, width) in pairs if width < resolution]:
         width, path = min(narrow)
         warn(
             f"data.resolution={resolution} is more than the width of {len(narrow)} of {len(paths)} "

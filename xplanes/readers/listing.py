@@ -317,16 +317,11 @@ def _refuse_repeats(
 def _require_shapes(listing: Listing) -> None:
     """Refuse images whose aspect ratio differs from their camera's, and masks of other sizes."""
     sizes = native_sizes(listing.paths)
-    shapes = map(misshapen, listing.paths, sizes, listing.calibrations)
-    problems = [problem for problem in shapes if problem is not None]
-    masked = [
-        (mask, path, size)
-        for mask, path, size in zip(listing.masks, listing.paths, sizes, strict=False)
-        if mask is not None
-    ]
-    for mask_size, (mask, path, size) in zip(
-        native_sizes([mask for mask, _, _ in masked]), masked, strict=True
-    ):
+    problems = [*filter(None, map(misshapen, listing.paths, sizes, listing.calibrations))]
+    each = zip(listing.masks, listing.paths, sizes, strict=False)
+    masked = [(mask, path, size) for mask, path, size in each if mask is not None]
+    mask_sizes = native_sizes([mask for mask, _, _ in masked])
+    for mask_size, (mask, path, size) in zip(mask_sizes, masked, strict=True):
         if mask_size != size:
             problems.append(mask_misfit(mask, mask_size, path, size))
     refuse_all(problems)

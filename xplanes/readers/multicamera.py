@@ -492,11 +492,8 @@ def _read_views(
     """All frames of all cameras, and the camera of each."""
     counts = torch.tensor([len(each) for each in numbers])
     camera = torch.arange(len(recordings)).repeat_interleave(counts)
-    frames = [
-        (recording, number)
-        for recording, own in zip(recordings, numbers, strict=True)
-        for number in own
-    ]
+    pairs = zip(recordings, numbers, strict=True)
+    frames = [(recording, number) for recording, own in pairs for number in own]
     native = [recording.size for recording in recordings]
     sources = [recording.camera.source for recording in recordings]
     sizes = final_sizes(sources, native, resolution)
@@ -506,24 +503,18 @@ def _read_views(
     intrinsics = final_intrinsics(labels, calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(recordings))]
     firsts = (counts.cumsum(0) - counts).tolist()
-    jobs = [
-        partial(_decoded, recording, own, size, shown, first)
-        for recording, own, size, shown, first in zip(
-            recordings, numbers, sizes, has_ray, firsts, strict=True
-        )
-    ]
+    decoded = zip(recordings, numbers, sizes, has_ray, firsts, strict=True)
+    jobs = [partial(_decoded, *arguments) for arguments in decoded]
     images = [recording.images[number] for recording, number in frames if recording.images]
     names = [[recording.camera.name, bool(recording.images)] for recording in recordings]
     span = [[own.start, own.stop, own.step] for own in numbers]
+    is_partial = any(shown is not None for shown in has_ray)
     pixels = store.images(
         [sizes[index] for index in camera.tolist()],
         jobs,
         [source for source in sources if source.is_file()] + images,
         ["multicamera", names, span, digests(has_ray)],
-        lambda: (
-            any(shown is not None for shown in has_ray)
-            or any(read_header(path)[1] for path in images)
-        ),
+        lambda: is_partial or any(read_header(path)[1] for path in images),
         cache,
     )
     views = Views(

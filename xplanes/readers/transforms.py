@@ -399,13 +399,9 @@ def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> C
 
 def warn_of_unknown(path: Path, content: Mapping[str, Any], unread: Sequence[str] = ()) -> None:
     """Warn about unknown and unread keys, which may affect images or cameras."""
-    entries = (content, *content["frames"])
-    given = {
-        key
-        for each in entries
-        for key, value in each.items()
-        if _has_content(value) or "color" in key  # Zeros in a colour mean black.
-    }
+    items = [item for each in (content, *content["frames"]) for item in each.items()]
+    # Zeros in a colour mean black.
+    given = {key for key, value in items if _has_content(value) or "color" in key}
     if unknown := sorted(given - ({*KNOWN, *IGNORED} - {*unread})):
         other = " data=nerfstudio reads times, masks and splits." if {*unread} & {*unknown} else ""
         warn(

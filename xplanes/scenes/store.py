@@ -354,15 +354,10 @@ def _write(path: Path, sizes: Sequence[Size], channels: int, jobs: Sequence[Job]
     from tqdm import tqdm
 
     first, lock = _firsts(sizes), threading.Lock()
+    how = {"unit": "image", "leave": False, "disable": not sys.stderr.isatty()}
     with (
         path.open("r+b", buffering=0) as file,
-        tqdm(
-            total=len(sizes),
-            desc="decoding",
-            unit="image",
-            leave=False,
-            disable=not sys.stderr.isatty(),
-        ) as bar,
+        tqdm(total=len(sizes), desc="decoding", **how) as bar,
     ):
         file.truncate(_length(sizes, channels))
 

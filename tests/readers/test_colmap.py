@@ -133,16 +133,6 @@ def test_text_and_binary_models_are_the_same(tmp_path):
 # Views
 
 
-def test_lenses_shrink_with_images(capture):
-    whole, half = (capture.views(resolution=width).intrinsics for width in (WIDTH, WIDTH // 2))
-    assert half.size.tolist() == [[HEIGHT // 2, WIDTH // 2]] * 8
-    for shrink, found in ((1, whole), (2, half)):
-        torch.testing.assert_close(found.focal[5] * shrink, torch.tensor(OPENCV[:2]).double())
-        torch.testing.assert_close(found.centre[5] * shrink, torch.tensor(OPENCV[2:4]).double())
-        named = dict(zip(COEFFICIENTS, found.lenses.coefficients[5].tolist(), strict=True))
-        assert [named[name] for name in ("k1", "k2", "p1", "p2")] == list(OPENCV[4:])
-
-
 def test_points_tell_how_well_the_cameras_fit(capture):
     scene = capture.read("train")
     assert scene.points.tolist() == torch.tensor(POINTS).tolist()

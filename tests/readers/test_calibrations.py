@@ -101,6 +101,12 @@ def build(folder, kind):
     return names
 
 
+def edit(folder, old, new, count=0):
+    """Replace a pattern in the files of a calibration."""
+    for path in [*folder.rglob("*.yml"), *folder.glob("*.json")]:
+        path.write_text(re.sub(old, new, path.read_text(), count=count))
+
+
 def read(folder, **changes):
     options = {"test_cameras": [], "orient": False, **changes}
     return settings(MultiCameraSettings, "multicamera", folder, **options).load(["train"])
@@ -160,8 +166,7 @@ def test_files_of_other_names_or_contents_are_no_calibrations(tmp_path):
 )
 def test_damaged_calibrations_are_refused_by_name(tmp_path, kind, old, new, words):
     build(tmp_path, kind)
-    for path in [*tmp_path.glob("*.yml"), *tmp_path.glob("*.json")]:
-        path.write_text(path.read_text().replace(old, new))
+    edit(tmp_path, re.escape(old), new)
     refused(partial(read, tmp_path), words)
 
 
@@ -184,8 +189,7 @@ def test_cameras_whose_pose_is_not_finite_are_left_out(tmp_path, kind):
     names = build(tmp_path, kind)
     nan = ".Nan" if "EasyMocap" in kind else "NaN"  # As OpenCV writes it.
     first = r'("position": \[|"t": \[\[|T_0?0: (?s:.*?)data: \[)[^,\]]+'
-    for path in [*tmp_path.rglob("*.yml"), *tmp_path.glob("*.json")]:
-        path.write_text(re.sub(first, rf"\g<1>{nan}", path.read_text(), count=1))
+    edit(tmp_path, first, rf"\g<1>{nan}", count=1)
     with told(f"1 of 4 cameras are left out:\n.*: {names[0]}: the pose|no camera of {names[0]}"):
         assert len(read(tmp_path).splits["train"]) == 9
 
@@ -193,8 +197,7 @@ def test_cameras_whose_pose_is_not_finite_are_left_out(tmp_path, kind):
 @pytest.mark.parametrize("lost", ["K_02", "R_02", "T_02"])
 def test_cameras_of_easymocap_that_saw_no_board_are_left_out(tmp_path, lost):
     build(tmp_path, "EasyMocap's vectors")
-    for path in tmp_path.glob("*.yml"):
-        path.write_text(path.read_text().replace(f"{lost}:", f"X{lost}:"))
+    edit(tmp_path, f"{lost}:", f"X{lost}:")
     with told("02 lack K, R or T, and are left out|no camera of 02"):
         assert len(read(tmp_path).splits["train"]) == 9
 

@@ -82,8 +82,8 @@ def rays(model, index, rows, columns):
     camera = model.calibrations[index]
     size = (int(camera.h), int(camera.w))
     focal, centre, skew = camera.scaled(size, size)
-    row = torch.zeros(1, len(COEFFICIENTS), dtype=torch.float64)
-    row[0, : len(camera.distortion)] = torch.tensor(camera.distortion, dtype=torch.float64)
+    row = [[camera.distortion.get(name, 0.0) for name in COEFFICIENTS]]
+    row = torch.tensor(row, dtype=torch.float64)
     lens = Lenses(torch.tensor([int(camera.model)]), row, torch.tensor([skew]))
     pixels = (torch.tensor(places, dtype=torch.float64) for places in (rows, columns))
     pose = torch.from_numpy(model.camera_to_world[index])
@@ -131,16 +131,6 @@ def test_text_and_binary_models_are_the_same(tmp_path):
 
 
 # Views
-
-
-def test_lenses_shrink_with_images(capture):
-    whole, half = (capture.views(resolution=width).intrinsics for width in (WIDTH, WIDTH // 2))
-    assert half.size.tolist() == [[HEIGHT // 2, WIDTH // 2]] * 8
-    for shrink, found in ((1, whole), (2, half)):
-        torch.testing.assert_close(found.focal[5] * shrink, torch.tensor(OPENCV[:2]).double())
-        torch.testing.assert_close(found.centre[5] * shrink, torch.tensor(OPENCV[2:4]).double())
-        named = dict(zip(COEFFICIENTS, found.lenses.coefficients[5].tolist(), strict=True))
-        assert [named[name] for name in ("k1", "k2", "p1", "p2")] == list(OPENCV[4:])
 
 
 def test_points_tell_how_well_the_cameras_fit(capture):

@@ -199,8 +199,9 @@ def test_missing_folder_names_its_neighbours_and_the_ways_out(scene):
     root = scene.path.parent
     for path, *words in (
         ("bal", f"{root}/bal does not exist", "ball", "xplanes download dnerf", "data=demo"),
-        ("ball/transforms_train.json", "is not a folder"),
+        ("ball/transforms_train.json", "is not a folder", "xplanes inspect FOLDER"),
         (".", f"holds no transforms_train.json. Such scenes in {root}: ball."),
+        ("ball/train", r"holds no transforms_train.json\. Set data\.root and data\.scene"),
     ):
         scene.path = root / path
         refused(scene.load, *words)

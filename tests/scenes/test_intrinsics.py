@@ -169,13 +169,8 @@ def test_rays_are_those_of_the_formula():
         assert np.abs(found[1].numpy() - directions).max() < 1e-6, index
 
 
-def test_background_and_near_rays_are_shares_of_what_is_no_padding():
+def test_images_of_nothing_but_padding_and_content_have_no_background():
     views = mixed(6)
-    batches = RayBatches(views, FRAME, RAYS, seed=0)
-    assert batches.near_pixels + batches.far_pixels == views.pixels
-    natural = batches.far_pixels / views.pixels
-    assert batches.skipped == pytest.approx(natural - 0.1)
-    # Images of nothing but padding and content have no background.
     images = views.images.clone()
     images[views.valid()] = 255
     assert RayBatches(replace(views, images=images), FRAME, RAYS, seed=0).far_pixels == 0
@@ -191,8 +186,9 @@ def test_padding_is_nothing_whatever_it_holds():
     dirty = replace(views, images=images)
     points = inside_ball(2000, 2.0)
     assert torch.equal(may_hold(dirty, points, radius=0.05), may_hold(views, points, radius=0.05))
-    assert torch.equal(foreground(dirty, 3), foreground(views, 3))
-    assert not foreground(dirty, 3)[~views.valid()].any()
+    near = foreground(dirty, [3] * 8)
+    assert torch.equal(near, foreground(views, [3] * 8))
+    assert not near[~views.valid()].any()
     assert scene_frame(dirty).scale == scene_frame(views).scale
     assert torch.equal(frusta_box(dirty, 2, 6, 1.0), frusta_box(views, 2, 6, 1.0))
     grids = [OccupancyGrid(8, 1, step=0.05) for _ in range(2)]
@@ -292,42 +288,33 @@ def test_a_scene_that_tells_every_frames_camera_equals_one_that_tells_an_angle(t
                 assert_same_rays(found, index, expected, index, atol=1e-6)
 
 
-def test_a_frames_own_keys_go_before_the_files(tmp_path):
-    shared = {"camera_angle_x": ANGLE, "fl_x": 30.0, "fl_y": 33.0, "cx": 6.5, "w": 12, "h": 18}
-    narrow = focal_length(0.5, 12)
-    cases = [
-        ({}, [30, 33], [6.5, 9]),
-        ({"fl_x": 20.0}, [20, 20], [6.5, 9]),  # As in instant-ngp, whose pixels are then square.
-        ({"fl_x": 20.0, "fl_y": 22.0, "cx": 5.0, "cy": 7.5}, [20, 22], [5, 7.5]),
-        ({"camera_angle_x": 0.5}, [narrow, narrow], [6.5, 9]),
-        ({"w": 24, "h": 36}, [15, 16.5], [3.25, 9]),
-    ]
-    frames, focal, centre = zip(*cases, strict=True)
-    scene = SceneFolder(tmp_path).add("train", [(12, 18)] * 5, shared=shared, frames=frames)
-    found = scene.train().intrinsics
-    torch.testing.assert_close(found.focal, torch.tensor(focal).double(), rtol=1e-6, atol=0)
-    assert found.centre.tolist() == list(centre)
+WHOLE = {"camera_angle_x": ANGLE, "fl_x": 30.0, "fl_y": 33.0, "cx": 6.5}
+BOTH = {"fl_x": 30.0, "fl_y": 33.0}
+FLAT = focal_length(0.5, 18)
 
 
 @pytest.mark.parametrize(
-    ("shared", "frame", "focal"),
+    ("shared", "frame", "focal", "centre", "words"),
     [
-        ({"fl_y": 33.0}, {"fl_x": 20.0}, [20, 33]),
-        ({"fl_x": 30.0, "camera_angle_y": 0.5}, {"fl_x": 20.0}, [20, 20]),
-        ({"fl_x": 30.0, "fl_y": 33.0, "camera_angle_y": 0.5}, {"fl_x": 20.0}, [20, 20]),
-        (
-            {"fl_x": 30.0, "fl_y": 33.0},
-            {"fl_x": 20.0, "camera_angle_y": 0.5},
-            [20, focal_length(0.5, 18)],
-        ),
+        (WHOLE, {}, [30, 33], [6.5, 9], "fl_x=30 is used"),
+        # As in instant-ngp, whose pixels are then square.
+        (WHOLE, {"fl_x": 20.0}, [20, 20], [6.5, 9], None),
+        (WHOLE, {"fl_x": 20.0, "fl_y": 22.0, "cx": 5.0, "cy": 7.5}, [20, 22], [5, 7.5], None),
+        (WHOLE, {"camera_angle_x": 0.5}, [focal_length(0.5, 12)] * 2, [6.5, 9], None),
+        (WHOLE, {"w": 24, "h": 36}, [15, 16.5], [3.25, 9], "fl_x=30 is used"),
+        ({"fl_y": 33.0}, {"fl_x": 20.0}, [20, 33], [6, 9], None),
+        ({"fl_x": 30.0, "camera_angle_y": 0.5}, {"fl_x": 20.0}, [20, 20], [6, 9], None),
+        ({**BOTH, "camera_angle_y": 0.5}, {"fl_x": 20.0}, [20, 20], [6, 9], None),
+        (BOTH, {"fl_x": 20.0, "camera_angle_y": 0.5}, [20, FLAT], [6, 9], "are not square"),
     ],
 )
-def test_the_focal_length_along_y_of_a_frame_with_one_along_x(tmp_path, shared, frame, focal):
+def test_a_frames_own_keys_go_before_the_files(tmp_path, shared, frame, focal, centre, words):
     shared = {"w": 12, "h": 18, **shared}
     scene = SceneFolder(tmp_path).add("train", [(12, 18)], shared=shared, frames=[frame])
-    with told("pixels that are not square" if "camera_angle_y" in frame else None):
-        found = scene.train().intrinsics.focal[0].tolist()
-    assert found == pytest.approx(focal)
+    with told(words):
+        found = scene.train().intrinsics
+    assert found.focal[0].tolist() == pytest.approx(focal)
+    assert found.centre[0].tolist() == centre
 
 
 def test_images_of_different_sizes_are_read(tmp_path):

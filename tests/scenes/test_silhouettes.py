@@ -26,7 +26,7 @@ def test_foreground_widens_by_whole_pixels():
     images[..., 3] = 0
     images[0, 5, 7, 3] = 255
     for margin in (0, 1, 3):
-        found = foreground(replace(views, images=images), margin)
+        found = foreground(replace(views, images=images), [margin] * 2)
         rows, columns = found[0].nonzero(as_tuple=True)
         assert (rows.min(), rows.max()) == (5 - margin, 5 + margin)
         assert (columns.min(), columns.max()) == (7 - margin, 7 + margin)

@@ -15,8 +15,9 @@ from xplanes.readers.entries import world_turn
 from xplanes.readers.formats import is_image
 from xplanes.readers.images import GREY
 from xplanes.readers.listing import Listing, read_views
-from xplanes.readers.masks import MASKS, MaskUse, chosen_use, survey
+from xplanes.readers.masks import MASKS, MaskUse, Meaning, chosen_use, survey
 from xplanes.readers.videos import SUFFIXES as VIDEOS
+from xplanes.readers.videos import is_video
 from xplanes.scenes.source import SceneSettings
 from xplanes.scenes.views import Scene, Views
 from xplanes.settings import Count
@@ -25,10 +26,7 @@ from xplanes.settings import Count
 def warn_of_masks(folder: Path, images: Sequence[Path], advice: str = "") -> None:
     """Warn about files and folders that seem to be masks, but are not read.
 
-    Args:
-        folder: The scene's folder.
-        images: Its images, without masks.
-        advice: What to do with masks; empty if they can be named.
+    Advice is empty if they can be named.
     """
     folder, images = folder.resolve(), [path.resolve() for path in images]
     places = {path.parent for path in images}
@@ -53,8 +51,7 @@ def warn_of_masks(folder: Path, images: Sequence[Path], advice: str = "") -> Non
 
 def warn_of_videos(folder: Path, images: Sequence[Path]) -> None:
     """Warn about several videos in a capture's folder, or in one inside, but for its images."""
-    inside = [path for pattern in ("*", "*/*") for path in folder.glob(pattern)]
-    inside = [path for path in inside if path.suffix.lower() in VIDEOS and path.name[0] != "."]
+    inside = [*filter(is_video, [*folder.glob("*"), *folder.glob("*/*")])]
     found = sorted(path.name for path in inside)
     if len(found) > 1:
         alike = {path.stem for path in images} <= {path.stem for path in inside}
@@ -69,22 +66,16 @@ def scene_of(
     settings: SceneSettings,
     parts: Mapping[str, Listing],
     mask_use: MaskUse,
-    masks: tuple[Sequence[Path | None], str],
+    masks: tuple[Sequence[Path | None], Meaning | None],
     up: str = "",
     video: Listing | None = None,
     points: Tensor | None = None,
 ) -> Scene:
     """The scene of listed images, which are decoded here.
 
-    Args:
-        settings: Settings with its folder and the width of its images.
-        parts: The images of each split.
-        mask_use: Meaning of the black parts of masks.
-        masks: Masks of the whole capture, from which their meaning is determined for all
-            splits, and what their source says of it, as in `Listing`.
-        up: Description of the up direction; empty if the files' world is unchanged.
-        video: Frames of a fixed camera, if there are some.
-        points: World points on surfaces, if known. [N, 3]
+    ``masks`` are those of the whole capture, from which their meaning is determined for all splits,
+    and what their source says of it, as in `Listing`. ``up`` describes the up direction, and is
+    empty if the files' world is unchanged.
 
     Raises:
         SceneError: If an image or a mask cannot be used, or with mask_use lrm if no training
@@ -98,7 +89,7 @@ def scene_of(
             "data.mask_use=lrm: no training image has a mask file. Add masks, or set it to auto."
         )
     if any(files):
-        kind = survey(files, told == "ignored")
+        kind = survey(files, told == "ignore")
         use, notes["masks"] = chosen_use(mask_use, kind, str(settings.folder), told)
 
     def read(part: Listing) -> Views:
@@ -149,15 +140,9 @@ class CaptureSettings(SceneSettings, ABC):
         points: np.ndarray | None = None,
         up: Tensor | None = None,
     ) -> Scene:
-        """The requested splits of a capture.
+        """The requested splits of a capture, from indices of each split's images in the list.
 
-        Args:
-            listing: All images.
-            places: Indices of each split's images in the list.
-            splits: Names of splits.
-            source: Source of the splits, for messages.
-            points: World points on surfaces. [N, 3]
-            up: The world's up vector, if the files give one. float64 [3]
+        ``points`` are on surfaces, in the world, [N, 3]; ``up`` is its up vector in the files.
 
         Raises:
             MissingSplitError: If a split has no images.
@@ -175,11 +160,12 @@ class CaptureSettings(SceneSettings, ABC):
             warn_of_masks(self.folder, listing.paths)
         warn_of_videos(self.folder, listing.paths)
         turn, words = world_turn(listing.camera_to_world, listing.paths, self.orient, up)
-        found = None if points is None else torch.from_numpy(points - np.array(listing.origin))
+        found = None
+        if points is not None:
+            found = torch.from_numpy(points - np.array(listing.origin))
+            found = (found if turn is None else found @ turn.T).float()
         if turn is not None:
             listing = listing.turned(turn)
-            found = None if found is None else found @ turn.T
         parts = self.thinned({split: listing.subset(places[split]) for split in splits})
-        found = None if found is None else found.float()
         masks = listing.masks, listing.mask_meaning
         return scene_of(self, parts, self.mask_use, masks, words, points=found)

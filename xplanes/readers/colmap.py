@@ -142,10 +142,9 @@ class ColmapSettings(CaptureSettings):
             name = model.names[place]
             return place, image_path(f"{model.source}: {name}", root, name, "NAME")
 
-        places = range(len(model.names))
-        kept, paths = zip(*usable("images", image_of, places), strict=True)
-        model = model.subset(kept)
-        labels = [f"{model.source}: {name}" for name in model.names]
+        kept, paths = zip(*usable("images", image_of, range(len(model.names))), strict=True)
+        names = tuple(model.names[place] for place in kept)
+        labels = [f"{model.source}: {name}" for name in names]
         # The search does not enter folders that are links.
         found = {*root.rglob("*")}.union(*(place.iterdir() for place in {p.parent for p in paths}))
         present = {
@@ -157,18 +156,18 @@ class ColmapSettings(CaptureSettings):
                 "%d of %d images in %s are not used, because COLMAP did not register them: %s",
                 *(len(rest), len(present), images, some(rest)),
             )
-        times, source = self._times(model.names, labels, used, present)
+        times, source = self._times(names, labels, used, present)
         return Listing.checked(
             model.source,
             labels,
             paths,
-            model.camera_to_world,
+            model.camera_to_world[[*kept]],
             times,
             files=tuple((_shown(images, self.folder) / name).as_posix() for name in used),
-            calibrations=model.calibrations,
-            masks=() if self.masks is None else self._masks(model.names, self.masks),
+            calibrations=tuple(model.calibrations[place] for place in kept),
+            masks=() if self.masks is None else self._masks(names, self.masks),
             time_source=source,
-            names=model.names,
+            names=names,
         )
 
     def _masks(self, names: Sequence[str], masks: str) -> tuple[Path | None, ...]:
@@ -185,22 +184,18 @@ class ColmapSettings(CaptureSettings):
         """Times from 0 to 1, and their source; no times if the scene is static."""
         if self.static:
             return [], ""
-        if self.times is None:
-            pattern = self.time_pattern
-            if (self.static, pattern) == (None, None) and self._as_llff:
-                return [], STATIC
-            if pattern is not None:
-                found = _matched(names, labels, pattern)
-            elif not (found := times_in_names(names, dynamic=self.static is False)):
-                return [], ""
-            origin = "the numbers in their names"
-        elif self.times == "rank":
-            found = _ranks(used, present)
-            origin = "their order in their folders"
-        else:
+        origin = "the numbers in their names"
+        if self.times == "rank":
+            found, origin = _ranks(used, present), "their order in their folders"
+        elif self.times is not None:
             path = self.folder / self.times
-            found = _listed_times(path, names)
-            origin = str(path)
+            found, origin = _listed_times(path, names), str(path)
+        elif self.time_pattern is not None:
+            found = _matched(names, labels, self.time_pattern)
+        elif self.static is None and self._as_llff:
+            return [], STATIC
+        elif not (found := times_in_names(names, dynamic=self.static is False)):
+            return [], ""
         logger.info(
             "The times of %d images, from 0 to 1, are %s, from %s to %s",
             *(len(names), origin, min(found), max(found)),
@@ -273,14 +268,7 @@ def _camera(name: str) -> str:
 
 
 def _image_folder(folder: Path, name: str, model: SparseModel) -> Path:
-    """The folder of the images of a model.
-
-    This is the nearest folder ``name`` in or above the model's folder. For the default name, it may
-    also be the only folder of the scene that contains the images, such as input.
-
-    Raises:
-        SceneError: If there is none.
-    """
+    """The nearest folder of a name in or above the model's; by default, any that has the images."""
     places = [place for place in model.source.parents if place.is_relative_to(folder)]
     for place in (*places, folder):
         if (place / name).is_dir():

@@ -10,7 +10,7 @@ import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -91,15 +91,6 @@ class SparseModel:
     points: np.ndarray | None
     error: float = math.nan
 
-    def subset(self, places: Sequence[int]) -> "SparseModel":
-        """The images at ``places``, in that order, and all points."""
-        return replace(
-            self,
-            names=tuple(self.names[place] for place in places),
-            camera_to_world=self.camera_to_world[list(places)],
-            calibrations=tuple(self.calibrations[place] for place in places),
-        )
-
 
 def find_model(folder: Path, names: Sequence[str] = MODELS) -> Path | None:
     """The first of the named folders inside ``folder`` that contains a sparse model."""
@@ -131,10 +122,7 @@ def image_count(folder: Path) -> int:
 
 
 def read_model(folder: Path) -> SparseModel:
-    """Read and check a sparse model; binary files take precedence over text files.
-
-    Args:
-        folder: Folder of cameras, images and points3D, each .bin or .txt.
+    """Read and check the sparse model in a folder; binary files take precedence over text files.
 
     Raises:
         SceneError: If a file is missing, damaged, or has a lens that is not supported.
@@ -383,9 +371,9 @@ def _calibration(
                 f"{label} has {key}={value}; it must be a finite number"
                 f"{' above 0' if key in sizes else ''}. Export the model again, or calibrate again."
             )
-    distortion = tuple(known.get(name, 0.0) for name in COEFFICIENTS)
+    distortion = {name: known[name] for name in COEFFICIENTS if name in known}
     if lens == LensModel.FOV:
-        distortion = (known["omega"],)
+        distortion = {"k1": known["omega"]}
         if not 0 <= known["omega"] < math.pi:
             raise SceneError(
                 f"{label} has omega={known['omega']}; it must lie between 0 and pi radians. "
@@ -399,7 +387,7 @@ def _calibration(
         w=width,
         h=height,
         model=lens,
-        distortion=distortion if any(distortion) else (),
+        distortion=distortion,
     )
 
 

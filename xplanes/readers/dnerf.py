@@ -1,6 +1,6 @@
 """Scenes on disk in the format of D-NeRF and Blender: transforms_train.json and its images."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -72,24 +72,23 @@ def read_scene(settings: SceneSettings, splits: Sequence[str], mask_use: MaskUse
     contents = readable([folder / f"transforms_{part}.json" for part in parts])
     span = time_span(contents.values())
     numbered = numbers(contents) if settings.static is False else None
-    listed = {split: _listed(split, path, span, numbered) for split, path in paths.items()}
+
+    def read(path: Path) -> Listing:
+        return listing_of(path, read_frames(path), span, movable=False, numbered=numbered)
+
+    listed = {split: _listed(split, path, read) for split, path in paths.items()}
     _warn_of_shared_files(folder, listed)
     listed = settings.thinned(listed)
-    video = _list_video(folder, span, numbered)
+    video = _list_video(folder / "transforms_video.json", read)
     _require_times(folder, listed if video is None else {**listed, "video": video})
     # Masks mean the same whichever parts are read.
     return scene_of(settings, listed, mask_use, all_masks(contents), video=video)
 
 
-def _listed(
-    split: str,
-    path: Path,
-    span: tuple[float, float] | None,
-    numbered: Mapping[str, float] | None,
-) -> Listing:
+def _listed(split: str, path: Path, read: Callable[[Path], Listing]) -> Listing:
     """The frames of a split; if a scored split has none, warns before `MissingSplitError`."""
     try:
-        return listing_of(path, read_frames(path), span, movable=False, numbered=numbered)
+        return read(path)
     except MissingSplitError as problem:
         if split != "train":
             first, *others = str(problem).splitlines()  # BlenderNeRF writes cameras without images.
@@ -143,13 +142,10 @@ def _transforms_path(folder: Path, split: str) -> Path:
     raise MissingSplitError(f"{path} does not exist. Splits of this scene: {names}. {way_out}")
 
 
-def _list_video(
-    folder: Path, span: tuple[float, float] | None, numbered: Mapping[str, float] | None
-) -> Listing | None:
-    path = folder / "transforms_video.json"
+def _list_video(path: Path, read: Callable[[Path], Listing]) -> Listing | None:
     if not path.is_file():
         return None
-    listing = listing_of(path, read_frames(path), span, movable=False, numbered=numbered)
+    listing = read(path)
     poses = listing.camera_to_world
     if not poses.allclose(poses[:1].expand_as(poses), atol=1e-4):
         raise SceneError(

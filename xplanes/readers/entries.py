@@ -1,5 +1,6 @@
 """Reading and checking of names, poses, numbers and times in camera files."""
 
+import itertools
 import json
 import logging
 import math
@@ -58,13 +59,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
     encoding of accents, as long as only one file matches; it may be percent-encoded. If there is no
     such path, its first folders are dropped one by one, as it may be a path of another machine.
     Relative names keep the folder of a split, and all folders if the last one exists. A name
-    without folders is also looked up in the folder ``images``.
-
-    Args:
-        label: The file and frame that name it, for messages.
-        folder: The scene's folder.
-        name: Name relative to ``folder``, or an absolute path into it.
-        key: The key of the name.
+    without folders is also looked up in the folder ``images``. ``label``, the file and frame that
+    name it, and ``key`` are for messages.
 
     Raises:
         BrokenFrameError: If there is no such file, or it is empty.
@@ -72,10 +68,8 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
     """
     choices = [*paths_inside(label, folder, name, key, "./train/r_000")]
     choices += [folder / "images" / path.name for path in choices if path.parent == folder]
-    image = next(filter(Path.is_file, choices), None)
-    if image is None:
-        image = next(filter(None, map(_similar, choices)), None)
-    if image is not None:
+    found = itertools.chain(filter(Path.is_file, choices), filter(None, map(_similar, choices)))
+    if (image := next(found, None)) is not None:
         if image.stat().st_size == 0:
             raise BrokenFrameError(f"{label}: {image} holds 0 bytes. Copy the file again.")
         return image
@@ -93,12 +87,7 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
 
 
 def usable(what: str, read: Callable[[Item], Found], items: Sequence[Item]) -> list[Found]:
-    """Results of a function for usable frames; warns about the others.
-
-    Args:
-        what: Name of the frames, for the warning.
-        read: The function; raises `BrokenFrameError` for a frame that is to be left out.
-        items: The frames.
+    """Results of a function for frames; warns about those for which it raises `BrokenFrameError`.
 
     Raises:
         MissingSplitError: If all frames are left out.
@@ -121,13 +110,9 @@ def usable(what: str, read: Callable[[Item], Found], items: Sequence[Item]) -> l
     return found
 
 
-def _stems(folder: Path) -> dict[str, list[Path]]:
-    """Images of a folder by name without suffix, in lower case."""
-    return _stems_at(folder, folder.stat().st_mtime_ns)
-
-
 @lru_cache(maxsize=64)
-def _stems_at(folder: Path, changed: int) -> dict[str, list[Path]]:
+def _stems(folder: Path, changed: int) -> dict[str, list[Path]]:
+    """Images of a folder, changed at a time, by name without suffix, in lower case."""
     found: dict[str, list[Path]] = {}
     inside = sorted(folder.iterdir())
     if len(inside) == 1 and inside[0].is_dir():  # The archive was unpacked one level too deep.
@@ -148,9 +133,8 @@ def _like(folder: Path) -> Path | None:
         return folder
     if (parent := _like(folder.parent)) is None:
         return None
-    names = [
-        path for path in parent.iterdir() if _normalised(path.name) == _normalised(folder.name)
-    ]
+    wanted = _normalised(folder.name)
+    names = [path for path in parent.iterdir() if _normalised(path.name) == wanted]
     return names[0] if len(names) == 1 and names[0].is_dir() else None
 
 
@@ -161,7 +145,7 @@ def _similar(image: Path) -> Path | None:
     if (parent := _like(image.parent)) is None:
         return None
     wanted = image.stem if image.suffix.lower() in ENDINGS else image.name
-    found = _stems(parent).get(_normalised(wanted), [])
+    found = _stems(parent, parent.stat().st_mtime_ns).get(_normalised(wanted), [])
     same = [path for path in found if _normalised(path.name) == _normalised(image.name)]
     chosen = [path for path in same if path.suffix == image.suffix] or same or found
     return chosen[0] if len(chosen) == 1 else None
@@ -176,14 +160,8 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
     """Paths that a name may refer to inside ``folder``, unchanged and with image suffixes.
 
     Links are followed, even out of the folder; ``..`` must not leave it, unless nothing is there
-    and the rest of the name leads to a file inside.
-
-    Args:
-        label: The file and frame that name it, for messages.
-        folder: The scene's folder.
-        name: Name relative to ``folder``, or an absolute path.
-        key: The key of the name.
-        example: A valid name, for messages.
+    and the rest of the name leads to a file inside. Arguments are those of `image_path`, and a
+    valid name for messages.
 
     Raises:
         BrokenFrameError: If it is empty or null.
@@ -229,11 +207,9 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
 
 
 def mask_files(folder: Path, names: Sequence[Sequence[str]]) -> tuple[Path | None, ...]:
-    """The mask of each image; None for images without a mask.
+    """The mask of each image, by its possible names without the ending in order of preference.
 
-    Args:
-        folder: Folder of masks.
-        names: Possible names of each image's mask without the ending, in order of preference. [V]
+    None for images without a mask. [V]
 
     Raises:
         SceneError: If no image has a mask.
@@ -273,11 +249,7 @@ def unit_times(times: Sequence[float], span: tuple[float, float] | None = None) 
 
 
 def read_object(path: Path, content: str) -> dict[str, Any]:
-    """A JSON object from a file.
-
-    Args:
-        path: The file.
-        content: Required content, for messages.
+    """A JSON object, whose content is described for messages, from a file.
 
     Raises:
         SceneError: If it cannot be read, or is not an object.
@@ -320,13 +292,9 @@ def decoded(content: bytes) -> str:
 def reading(path: Path, how: str = "", advice: str = "") -> Iterator[None]:
     """Refuse a file that was not fetched, such as a pointer of Git LFS, or that cannot be read.
 
-    Args:
-        path: The file that is read in the block.
-        how: How it is read, such as "as JSON", for the message.
-        advice: Further text of the message.
-
     Raises:
-        SceneError: With the kind of placeholder, or the problem in the block.
+        SceneError: With the kind of placeholder, or the problem in the block, how the file is read
+            there, such as "as JSON", and advice.
     """
     if (other := stand_in(path)) is not None:
         raise SceneError(f"{path} {other}.")
@@ -340,12 +308,7 @@ def reading(path: Path, how: str = "", advice: str = "") -> Iterator[None]:
 
 
 def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.ndarray:
-    """A camera-to-world matrix: finite, rigid, right-handed.
-
-    Args:
-        label: Its file and frame, for messages.
-        matrix: 4 rows of 4 numbers; the last row may be missing.
-        key: Its key there.
+    """A camera-to-world matrix: finite, rigid, right-handed; its last row may be missing.
 
     Returns:
         The matrix. float64 [4, 4]
@@ -449,17 +412,10 @@ def origin_near(source: Path, positions: np.ndarray, movable: bool = True) -> np
     """A point relative to which single precision resolves the cameras: if possible, the origin.
 
     Captures in map coordinates lie millions of metres away, where numbers are half a metre apart.
-
-    Args:
-        source: File of the cameras, for messages.
-        positions: Positions of all cameras of a capture. float64 [V, 3]
-        movable: Whether it may be another point than the origin.
-
-    Returns:
-        float64 [3]
+    float64 [V, 3] -> float64 [3]
 
     Raises:
-        SceneError: If there is no such point.
+        SceneError: If there is no such point, or it is not the origin and may not be moved.
     """
     extent = float(np.ptp(positions, axis=0).max())
     fixed = extent <= SAME_PLACE
@@ -482,38 +438,6 @@ def origin_near(source: Path, positions: np.ndarray, movable: bool = True) -> np
             f"({x:.0f}, {y:.0f}, {z:.0f}): data.centre and exports are as well."
         )
     return origin
-
-
-def refuse_repeats(
-    labels: Sequence[str], paths: Sequence[Path], poses: np.ndarray, times: Sequence[float]
-) -> None:
-    """Refuse images that are listed twice.
-
-    Args:
-        labels: The file and frame of each image, for messages. [V]
-        paths: Image files. [V]
-        poses: Their cameras. [V, 4, 4]
-        times: Their times; equal or empty for a static scene, whose cameras may repeat. [V]
-
-    Raises:
-        SceneError: If a file, or a pair of camera and time, occurs twice.
-    """
-    files: dict[Path, str] = {}
-    seen: dict[tuple[bytes, float], str] = {}
-    moving = len(set(times)) > 1
-    for index, label in enumerate(labels):
-        other = files.setdefault(paths[index], label)
-        if other is not label:
-            raise SceneError(f"{label} has the same file as {other}. Remove one of the two.")
-        # In a static scene, a camera may pass the same place twice.
-        if not moving:
-            continue
-        other = seen.setdefault((poses[index].tobytes(), times[index]), label)
-        if other is not label:
-            raise SceneError(
-                f"{label} has the same camera and time as {other}. Remove one of the two, or "
-                f"correct its time."
-            )
 
 
 def is_number(value: Any) -> TypeGuard[float]:

@@ -150,7 +150,6 @@ def open_image(path: Path) -> Iterator[Image.Image]:
 
 
 def _unreadable(path: Path, problem: BaseException) -> SceneError:
-    """The error for a file that cannot be decoded, with the decoder's error."""
     if (other := stand_in(path)) is not None:
         return SceneError(f"{path} {other}.")
     kind = "a camera's raw format" if path.suffix.lower() in RAW else None

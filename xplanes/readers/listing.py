@@ -1,8 +1,8 @@
 """Lists of images with poses and times, and their conversion to views."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from xplanes.errors import MissingSplitError, SceneError, refuse_all, some, warn
-from xplanes.readers.entries import origin_near, refuse_repeats
+from xplanes.readers.entries import origin_near
 from xplanes.readers.formats import UNTURN, mask_misfit, orientation
 from xplanes.readers.images import GREY, Picture, Size, final_sizes, native_sizes, read_images
-from xplanes.readers.masks import MaskKind, ignored_pixels
+from xplanes.readers.masks import MaskKind, Meaning, ignored_pixels
 from xplanes.scenes.lenses import COEFFICIENTS, Lenses, LensModel
 from xplanes.scenes.source import held_out_places
 from xplanes.scenes.views import Intrinsics, Views, spread
@@ -48,7 +48,7 @@ class Calibration:
         w: Width of the image to which these numbers refer; None for that of the image file.
         h: Its height.
         model: Kind of lens.
-        distortion: Coefficients in the order of `COEFFICIENTS`; empty if there is no distortion.
+        distortion: Coefficients by their names in `COEFFICIENTS`; others are 0.
         skew: Shift to the right in pixels per focal length downwards.
     """
 
@@ -60,7 +60,7 @@ class Calibration:
     w: float | None = None
     h: float | None = None
     model: LensModel = LensModel.PERSPECTIVE
-    distortion: tuple[float, ...] = ()
+    distortion: Mapping[str, float] = field(default_factory=dict)
     skew: float = 0.0
 
     def scaled(
@@ -92,8 +92,8 @@ class Calibration:
         """Description of the lens, for messages."""
         named = [
             f"{'omega' if self.model == LensModel.FOV else name}={value:g}"
-            for name, value in zip(COEFFICIENTS, self.distortion, strict=False)
-            if value
+            for name in COEFFICIENTS
+            if (value := self.distortion.get(name))
         ]
         return f"{self.model.name.lower()} lens with {', '.join(named) or 'no distortion'}"
 
@@ -110,8 +110,7 @@ class Listing:
         calibrations: Focal length, principal point and lens of each image. [V]
         masks: A mask file for each image, white where it shows the scene and black elsewhere, or
             None for an image without; empty if there are none. [V]
-        mask_meaning: Meaning of masks as defined by the source: "alpha", or "ignored" (white where
-            pixels are to be ignored); empty if it does not define it.
+        mask_meaning: Meaning of masks as defined by the source; None if it does not define it.
         clear: Grey levels, out of 255, that are transparent in its images.
         time_source: Source of the times, with examples; empty if there are no times.
         names: Their names in the file of the cameras; empty if nothing else refers to them. [V]
@@ -124,7 +123,7 @@ class Listing:
     times: Tensor
     calibrations: tuple[Calibration, ...]
     masks: tuple[Path | None, ...] = ()
-    mask_meaning: str = ""
+    mask_meaning: Meaning | None = None
     clear: tuple[int, ...] = ()
     time_source: str = ""
     names: tuple[str, ...] = ()
@@ -146,16 +145,9 @@ class Listing:
     ) -> "Listing":
         """A list of images that has passed the checks common to all formats.
 
-        Warns about images without a mask among others that have one.
-
-        Args:
-            source: File of the cameras, for messages.
-            labels: The file and frame of each image, for messages. [V]
-            paths: Image files. [V]
-            poses: Camera-to-world matrices with OpenGL's axes. float64 [V, 4, 4]
-            times: From 0 to 1; empty for a static scene. [V]
-            movable: Whether the poses may get another origin, if the files' is too far away.
-            **more: Further attributes.
+        Warns about images without a mask among others that have one. The file of the cameras, and
+        labels of the images, are for messages. Poses are float64, may be read relative to another
+        origin if ``movable``, and no times mean a static scene; ``more`` are further attributes.
 
         Raises:
             SceneError: If cameras are too far away, an image is listed twice, or the sizes of files
@@ -163,7 +155,7 @@ class Listing:
         """
         origin, poses = origin_near(source, poses[:, :3, 3], movable), poses.copy()
         poses[:, :3, 3] -= origin
-        refuse_repeats(labels, paths, poses, times)
+        _refuse_repeats(labels, paths, poses, times)
         listing = cls(
             paths=tuple(paths),
             camera_to_world=torch.from_numpy(poses).float(),
@@ -199,13 +191,7 @@ class Listing:
 
 
 def time_source(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
-    """Description of the times' source, with examples.
-
-    Args:
-        origin: The source.
-        files: Names of the images. [V]
-        times: Their times as given. [V]
-    """
+    """Description of the times' source, with examples: files and times as given. [V], [V]"""
     low, high = min(times), max(times)
     # Six digits of what differs, as clocks count from 1970.
     largest = max(abs(low), abs(high))
@@ -307,32 +293,42 @@ def _without_ignored(listing: Listing, rest: Sequence[int]) -> Listing:
     return listing.subset(rest)
 
 
+def _refuse_repeats(
+    labels: Sequence[str], paths: Sequence[Path], poses: np.ndarray, times: Sequence[float]
+) -> None:
+    """Refuse files, and pairs of camera and time in a dynamic scene, that are listed twice."""
+    seen: dict[Any, str] = {}
+    moving = len(set(times)) > 1
+    for index, label in enumerate(labels):
+        other = seen.setdefault(paths[index], label)
+        if other is not label:
+            raise SceneError(f"{label} has the same file as {other}. Remove one of the two.")
+        # In a static scene, a camera may pass the same place twice.
+        if not moving:
+            continue
+        other = seen.setdefault((poses[index].tobytes(), times[index]), label)
+        if other is not label:
+            raise SceneError(
+                f"{label} has the same camera and time as {other}. Remove one of the two, or "
+                f"correct its time."
+            )
+
+
 def _require_shapes(listing: Listing) -> None:
     """Refuse images whose aspect ratio differs from their camera's, and masks of other sizes."""
     sizes = native_sizes(listing.paths)
-    shapes = map(misshapen, listing.paths, sizes, listing.calibrations)
-    problems = [problem for problem in shapes if problem is not None]
-    masked = [
-        (mask, path, size)
-        for mask, path, size in zip(listing.masks, listing.paths, sizes, strict=False)
-        if mask is not None
-    ]
-    for mask_size, (mask, path, size) in zip(
-        native_sizes([mask for mask, _, _ in masked]), masked, strict=True
-    ):
+    problems = [*filter(None, map(misshapen, listing.paths, sizes, listing.calibrations))]
+    each = zip(listing.masks, listing.paths, sizes, strict=False)
+    masked = [(mask, path, size) for mask, path, size in each if mask is not None]
+    mask_sizes = native_sizes([mask for mask, _, _ in masked])
+    for mask_size, (mask, path, size) in zip(mask_sizes, masked, strict=True):
         if mask_size != size:
             problems.append(mask_misfit(mask, mask_size, path, size))
     refuse_all(problems)
 
 
 def misshapen(path: Path, size: Size, camera: Calibration) -> str | None:
-    """An error message if the size of an image or video contradicts its calibration; else None.
-
-    Args:
-        path: The file.
-        size: Its height and width.
-        camera: Its calibration.
-    """
+    """An error message if the size of an image or video contradicts its calibration; else None."""
     if camera.w is None or camera.h is None:
         return None
     height, width = size
@@ -365,13 +361,8 @@ def final_intrinsics(
     """Intrinsics of images in their final sizes.
 
     Warns about perspective lenses that map no direction to some of the pixels, and about principal
-    points far from the middle.
-
-    Args:
-        labels: The images, for messages. [V]
-        calibrations: Their calibrations. [V]
-        native: Heights and widths of the files. [V]
-        sizes: Final heights and widths. [V]
+    points far from the middle. Labels, calibrations, and sizes of the files and in the end are
+    those of the images. [V]
 
     Raises:
         SceneError: If a camera's intrinsics are implausible, or if most pixels of a perspective
@@ -387,8 +378,7 @@ def final_intrinsics(
     focal, centre, skew = (
         torch.tensor(values, dtype=torch.float64) for values in zip(*known, strict=True)
     )
-    pad = (0.0,) * len(COEFFICIENTS)
-    rows = [(c.distortion + pad)[: len(COEFFICIENTS)] for c in calibrations]
+    rows = [[each.distortion.get(name, 0.0) for name in COEFFICIENTS] for each in calibrations]
     model = torch.tensor([int(calibration.model) for calibration in calibrations])
     lenses = Lenses(model, torch.tensor(rows, dtype=torch.float64), skew)
     intrinsics = Intrinsics(focal, centre, torch.tensor(sizes), lenses)
@@ -420,7 +410,7 @@ def _require_real(
             f"{label}: the skew is {skew:.3g} pixels, more than the focal length of "
             f"{focal[0]:.3g}. Correct the camera, or calibrate again."
         )
-    if any(not abs(value) <= STRONGEST for value in camera.distortion):
+    if any(not abs(value) <= STRONGEST for value in camera.distortion.values()):
         raise SceneError(
             f"{label}: its {camera.description}; no coefficient may exceed {STRONGEST:g}. Correct "
             "the camera, or calibrate again."
@@ -449,10 +439,7 @@ def _warn_of_other_units(
 def _require_rays(
     labels: Sequence[str], cameras: Sequence[Calibration], intrinsics: Intrinsics
 ) -> None:
-    """Refuse images where most pixels of a perspective lens, or all pixels of another, lack rays.
-
-    Fewer such pixels of a perspective lens are left out, with a warning.
-    """
+    """Refuse images where most pixels of a perspective lens, or all of another, lack rays."""
     problems: list[str] = []
     folded: list[tuple[float, str]] = []
     for index, (label, lens) in enumerate(zip(labels, cameras, strict=True)):

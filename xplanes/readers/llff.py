@@ -42,24 +42,25 @@ class LlffSettings(CaptureSettings):
         path = self.folder / POSES
         if not (path.is_file() and (found := _image_folders(self.folder))):
             raise self.no_scene()
-        rows = len(read_array(path, "Export or download it again."))
+        count = len(read_array(path, "Export or download it again."))
         # A folder of copies may lack some.
-        found = [images for images in found if len(images) == rows] or found
+        found = [images for images in found if len(images) == count] or found
         images = min(
             found, key=lambda each: width_rank(native_sizes(each[:1])[0][1], self.resolution)
         )
-        images, labels, poses, calibrations = zip(*read_poses_bounds(path, images), strict=True)
+        rows = read_poses_bounds(path, images)
+        images = [row.source for row in rows]
         names = [image.name for image in images]
         dynamic = self.static is False or is_dynamic(self.folder)
         times = times_in_names(names, True, OTHER_TIMES) if dynamic else []
         listing = Listing.checked(
             path,
-            labels,
+            [row.label for row in rows],
             images,
-            np.stack(poses),
+            np.stack([row.pose for row in rows]),
             unit_times(times) if times else [],
             files=tuple(image.relative_to(self.folder).as_posix() for image in images),
-            calibrations=calibrations,
+            calibrations=tuple(row.calibration for row in rows),
             time_source=time_source("the numbers in their names", names, times)
             if times
             else STATIC,

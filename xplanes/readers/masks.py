@@ -24,6 +24,9 @@ alpha: empty space; ignore: pixels to ignore; lrm: removed only from the LRM's i
 space if masks look like silhouettes, else pixels to ignore.
 """
 
+Meaning = Literal["alpha", "ignore"]
+"""Meaning of masks by their source or look; a source's own to ignore are white, not black."""
+
 MASKS = re.compile(r"(?i)mask|(?<![a-z])mattes?(?![a-z])|silhouette")
 """Part of the names of masks."""
 
@@ -84,7 +87,7 @@ class MaskKind:
     equal: bool = False
 
     @property
-    def use(self) -> Literal["alpha", "ignore"]:
+    def use(self) -> Meaning:
         """Meaning of the black parts: empty if the masks are silhouettes, else to be ignored."""
         return "alpha" if self.edge >= SILHOUETTE_EDGE and not self.shared else "ignore"
 
@@ -99,11 +102,7 @@ class MaskKind:
 
 
 def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
-    """Determine the meaning of a capture's masks from a sample of them.
-
-    Args:
-        masks: A file for each image, or None. [V]
-        inverted: Whether white pixels are masked out.
+    """Determine the meaning of a capture's masks, of which white pixels may be masked out. [V]
 
     Raises:
         SceneError: If a mask cannot be decoded.
@@ -148,21 +147,13 @@ def _has_regions(grey: np.ndarray) -> bool:
     return not above.any() or any(len(same) and same.mean() >= RUNS for same in (across, down))
 
 
-def chosen_use(use: MaskUse, kind: MaskKind, where: str, told: str = "") -> tuple[MaskUse, str]:
-    """The use of a capture's masks, and a description; warns if it is ambiguous.
-
-    Args:
-        use: The setting ``data.mask_use``.
-        kind: Result of `survey`.
-        where: Source of the masks, for messages.
-        told: Meaning as defined by their source, "alpha" or "ignored"; empty if undefined.
-    """
+def chosen_use(
+    use: MaskUse, kind: MaskKind, where: str, told: Meaning | None
+) -> tuple[MaskUse, str]:
+    """The use of a capture's masks by ``data.mask_use``, and a description; warns if ambiguous."""
     if use == "lrm":
         return use, "for LRMs alone (data.mask_use=lrm)"
-    found: MaskUse = use
-    if use == "auto":
-        known: dict[str, MaskUse] = {"alpha": "alpha", "ignored": "ignore"}
-        found = known.get(told, kind.use)
+    found: MaskUse = (told or kind.use) if use == "auto" else use
     meaning = {
         "alpha": "silhouettes: what they leave out is empty",
         "ignore": "pixels to ignore: what they leave out is neither trained on nor scored",
@@ -185,13 +176,8 @@ def read_mask(path: Path, kind: MaskKind, image: Path | None = None) -> np.ndarr
 
     Masks with transparency are read from alpha; in coloured masks only black is masked out.
 
-    Args:
-        path: The file.
-        kind: Meaning of the capture's masks.
-        image: The image whose size the mask must have; None for any size.
-
     Raises:
-        SceneError: If it cannot be decoded, or has another size.
+        SceneError: If it cannot be decoded, or has another size than its image, if that is given.
     """
     grey, _ = _stored(path)
     if image is not None and grey.shape != (wanted := read_header(image)[0]):
@@ -212,13 +198,7 @@ def ignored_pixels(
     sizes: Sequence[tuple[int, int]],
     kind: MaskKind,
 ) -> Tensor:
-    """Pixels of reduced images whose mask coverage is below `KEPT`, padded. bool [V, H, W]
-
-    Args:
-        masks: A file for each image, or None. [V]
-        images: The images. [V]
-        sizes: Their heights and widths. [V]
-        kind: As for `read_mask`.
+    """Pixels of images, reduced to sizes, with mask coverage below `KEPT`, padded. bool [V, H, W]
 
     Raises:
         SceneError: If a mask cannot be decoded, or has another size than its image.

@@ -203,13 +203,7 @@ class Recording:
 def _without_short(
     folder: Path, recordings: list[Recording], named: Sequence[str | None]
 ) -> list[Recording]:
-    """Without cameras that stopped early, as only frames of all cameras are read.
-
-    Args:
-        folder: The scene's folder, for the warning.
-        recordings: All cameras.
-        named: Names of cameras that stay.
-    """
+    """Without cameras that stopped early, but for named ones: only frames of all are read."""
     usual = float(np.median([recording.count for recording in recordings]))
     short = [r for r in recordings if r.count < SHORT * usual and r.camera.name not in named]
     if not short or len(recordings) - len(short) < 2:
@@ -304,11 +298,7 @@ def _warn_of_timesteps(folder: Path, recordings: Sequence[Recording]) -> None:
 def _are_stamped(recordings: Sequence[Recording]) -> bool:
     """Whether to use the recordings' times: if frame rates differ, or frames are unevenly spaced.
 
-    Otherwise frames with the same number are simultaneous. Warns if videos begin at different
-    times.
-
-    Raises:
-        SceneError: If rates differ and a recording has no times.
+    Otherwise frames with the same number are simultaneous.
     """
     timed = sorted((r.rate, r.camera.source) for r in recordings if r.rate) or [(1.0, Path())]
     (slow, first), (fast, other) = timed[0], timed[-1]
@@ -338,14 +328,11 @@ def _are_stamped(recordings: Sequence[Recording]) -> bool:
 
 
 def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
-    """The recordings, without images of timesteps that some cameras lack; warns about these images.
+    """The recordings, without images of timesteps that some cameras lack.
 
     Images of equal numbers are simultaneous; of clocks, which differ, those of the nearest ones.
     If the cameras' numbers do not overlap, they are counted from the first of each camera. Those of
     the first camera become the images' times, as all cameras may lack the same ones.
-
-    Raises:
-        SceneError: If images are missing, and other cameras have videos.
     """
     numbers = _numbers(recordings)
     each = list(numbers.values())
@@ -422,11 +409,7 @@ def _counts(recordings: Sequence[Recording]) -> str:
 
 
 def _partners(each: Sequence[Sequence[Number]], nearest: bool) -> tuple[np.ndarray, float, float]:
-    """The images of all cameras that are simultaneous.
-
-    Args:
-        each: Numbers of each camera's images. [C]
-        nearest: Whether numbers may differ, as those of clocks do.
+    """Images that are simultaneous by their numbers, which may differ if ``nearest``.
 
     Returns:
         Indices of the images of each timestep, int64 [C, T]; the largest difference between their
@@ -509,11 +492,8 @@ def _read_views(
     """All frames of all cameras, and the camera of each."""
     counts = torch.tensor([len(each) for each in numbers])
     camera = torch.arange(len(recordings)).repeat_interleave(counts)
-    frames = [
-        (recording, number)
-        for recording, own in zip(recordings, numbers, strict=True)
-        for number in own
-    ]
+    pairs = zip(recordings, numbers, strict=True)
+    frames = [(recording, number) for recording, own in pairs for number in own]
     native = [recording.size for recording in recordings]
     sources = [recording.camera.source for recording in recordings]
     sizes = final_sizes(sources, native, resolution)
@@ -523,24 +503,18 @@ def _read_views(
     intrinsics = final_intrinsics(labels, calibrations, native, sizes)
     has_ray = [intrinsics.has_ray(index) for index in range(len(recordings))]
     firsts = (counts.cumsum(0) - counts).tolist()
-    jobs = [
-        partial(_decoded, recording, own, size, shown, first)
-        for recording, own, size, shown, first in zip(
-            recordings, numbers, sizes, has_ray, firsts, strict=True
-        )
-    ]
+    decoded = zip(recordings, numbers, sizes, has_ray, firsts, strict=True)
+    jobs = [partial(_decoded, *arguments) for arguments in decoded]
     images = [recording.images[number] for recording, number in frames if recording.images]
     names = [[recording.camera.name, bool(recording.images)] for recording in recordings]
     span = [[own.start, own.stop, own.step] for own in numbers]
+    is_partial = any(shown is not None for shown in has_ray)
     pixels = store.images(
         [sizes[index] for index in camera.tolist()],
         jobs,
         [source for source in sources if source.is_file()] + images,
         ["multicamera", names, span, digests(has_ray)],
-        lambda: (
-            any(shown is not None for shown in has_ray)
-            or any(read_header(path)[1] for path in images)
-        ),
+        lambda: is_partial or any(read_header(path)[1] for path in images),
         cache,
     )
     views = Views(

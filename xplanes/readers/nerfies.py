@@ -246,9 +246,8 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
     # The first captures use another key.
     tangential = "tangential" if "tangential" in content else "tangential_distortion"
     none = {"radial_distortion": [0, 0, 0], tangential: [0, 0]}
-    k1, k2, k3 = _numbers(path, none | content, "radial_distortion", 3)
-    p1, p2 = _numbers(path, none | content, tangential, 2)
-    distortion = (k1, k2, k3, 0.0, 0.0, 0.0, p1, p2)
+    radial = _numbers(path, none | content, "radial_distortion", 3)
+    distortion = [*radial, *_numbers(path, none | content, tangential, 2)]
     calibration = Calibration(
         fl_x=float(focal),
         fl_y=focal * aspect,
@@ -256,7 +255,7 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
         cy=float(centre_y),
         w=float(width),
         h=float(height),
-        distortion=tuple(map(float, distortion)) if any(distortion) else (),
+        distortion=dict(zip(("k1", "k2", "k3", "p1", "p2"), map(float, distortion), strict=True)),
         skew=float(skew),
     )
     return pose, calibration
@@ -265,11 +264,9 @@ def _camera(path: Path) -> tuple[np.ndarray, Calibration]:
 def _picture_folder(
     folder: Path, names: Sequence[str], resolution: int | None
 ) -> tuple[str, set[str]]:
-    """The folder in rgb of the smallest images that are at least as wide as requested.
+    """The folder in rgb of the width that `width_rank` prefers, and the images that it lacks.
 
-    If there are none, or no width is requested, that of the largest images. If it lacks images,
-    warns and uses the folder that lacks the fewest, preferring the next larger scale.
-    Also returns the names of the images that it lacks.
+    If it lacks some, the one that lacks the fewest is used, preferably of the next larger scale.
     """
     widths: dict[str, int] = {}
     lost: dict[str, list[str]] = {}

@@ -213,7 +213,7 @@ def recordings_below(folder: Path, *others: str) -> list[Path]:
 def recordings_of_rows(folder: Path) -> list[Path]:
     """Recordings with rows in poses_bounds.npy: of any name if there are only videos."""
     inside = sorted(path for path in folder.iterdir() if path.name[0] != ".")
-    loose = _colours([path for path in inside if path.suffix.lower() in videos.SUFFIXES])
+    loose = _colours([*filter(videos.is_video, inside)])
     images = any(path.name.startswith("images") or path.name.lower() in IMAGES for path in inside)
     return recordings_below(folder) or ([] if images or len(loose) < 2 else loose)
 
@@ -256,7 +256,7 @@ def _is_filled(path: Path) -> bool:
 
 
 def _is_recording(path: Path) -> bool:
-    return path.name[0] != "." and (path.is_dir() or path.suffix.lower() in videos.SUFFIXES)
+    return videos.is_video(path) or (path.is_dir() and path.name[0] != ".")
 
 
 def _from_poses_bounds(folder: Path) -> list[Camera]:
@@ -271,20 +271,11 @@ def _from_poses_bounds(folder: Path) -> list[Camera]:
             f"{path}: rows are in the plain order of names, as LLFF writes them: {pairs}. If they "
             "have the order of the numbers, write these with leading zeros."
         )
-    return [
-        Camera(camera_name(source), source, pose, calibration, label)
-        for source, label, pose, calibration in read_poses_bounds(path, sources)
-    ]
+    return read_poses_bounds(path, sources)
 
 
-def read_poses_bounds(
-    path: Path, sources: Sequence[Path]
-) -> list[tuple[Path, str, np.ndarray, Calibration]]:
-    """Source, label, pose and calibration of each row of poses_bounds.npy.
-
-    Args:
-        path: The file.
-        sources: Images, videos or folders of the rows, in order.
+def read_poses_bounds(path: Path, sources: Sequence[Path]) -> list[Camera]:
+    """The cameras of poses_bounds.npy, whose rows are of images, videos or folders in this order.
 
     Raises:
         SceneError: If it cannot be read, or has another number of rows.
@@ -302,8 +293,9 @@ def read_poses_bounds(
             f"numbers): {names}. Add what is missing, or take the others' rows out."
         )
 
-    def read(index: int) -> tuple[Path, str, np.ndarray, Calibration]:
-        row, label = rows[index], f"{path}: row {index} ({sources[index].name})"
+    def read(index: int) -> Camera:
+        row, source = rows[index], sources[index]
+        label = f"{path}: row {index} ({source.name})"
         matrix = row[:15].astype(np.float64).reshape(3, 5)
         down, right, back, centre, (height, width, focal) = matrix.T
         pose = np.eye(4)
@@ -313,7 +305,7 @@ def read_poses_bounds(
             if not is_positive(float(value)):
                 raise SceneError(f"{label}: {key} is {value:g}; it must be above 0. Export again.")
         calibration = Calibration(fl_x=float(focal), w=float(width), h=float(height))
-        return sources[index], label, pose, calibration
+        return Camera(camera_name(source), source, pose, calibration, label)
 
     return usable("rows", read, range(len(rows)))
 
@@ -465,13 +457,10 @@ def _kind_of_panel(camera: Camera) -> str:
 
 
 def _counted(model: SparseModel, recordings: Sequence[Path]) -> dict[str, list[Path]]:
-    """Recordings by image1, image2, ...; empty if images have other names.
-
-    4DGaussians copies an image of each camera to these names, with the number of cam01 and the
-    like. Without such numbers they are counted.
-    """
+    """Recordings by image1, image2, ... (4DGaussians); empty if images have other names."""
     named = {camera_name(path): path for path in recordings}
     names = sorted(named, key=natural)
+    # An image has the number of cam01 and the like; without such numbers they are counted.
     numbers = [int(match[0]) for name in names if (match := re.search(r"\d+$", name))]
     if len(numbers) < len(names) or 0 in numbers:
         numbers = range(1, len(names) + 1)
@@ -486,29 +475,15 @@ def _counted(model: SparseModel, recordings: Sequence[Path]) -> dict[str, list[P
 
 
 def _videos_by_name(folder: Path) -> dict[str, Path]:
-    """Videos in a folder and in those inside, by their names without the ending.
-
-    Those in the folder come before others, and videos of masks and the like do not count.
-    """
+    """Videos in a folder, or else in one inside that is not of masks, by name without ending."""
     folder = folder.resolve()
     inside = [p for p in sorted(folder.glob("*/*")) if not OTHER_KINDS.search(p.parent.name)]
-    found = [*inside, *sorted(folder.glob("*"))]
-    return {
-        path.stem: path
-        for path in found
-        if path.suffix.lower() in videos.SUFFIXES and not path.name.startswith(".")
-    }
+    found = filter(videos.is_video, [*inside, *sorted(folder.glob("*"))])
+    return {path.stem: path for path in found}
 
 
 def _source(label: str, folder: Path, name: Any, named: Mapping[str, Path]) -> Path:
-    """The video or the folder of images that a frame names.
-
-    Args:
-        label: The file and frame, for messages.
-        folder: The scene's folder.
-        name: Name of the video, which may have another ending, of the folder, or of an image in it.
-        named: Result of `_videos_by_name`.
-    """
+    """The video or folder of images that a frame names, perhaps by an image or another ending."""
     for source in paths_inside(label, folder, name, "file_path", "cam00.mp4"):
         if source.is_dir() or (source.is_file() and source.suffix.lower() in videos.SUFFIXES):
             break
@@ -531,10 +506,10 @@ def with_frames(source: Path) -> Path:
     """A camera's source, or the only video in its folder if no images lie beside it."""
     if source.is_file():
         return source
-    inside = [path for path in source.iterdir() if path.is_file() and path.name[0] != "."]
+    inside = [*filter(Path.is_file, source.iterdir())]
     if any(map(is_image, inside)):
         return source
-    found = [path for path in inside if path.suffix.lower() in videos.SUFFIXES]
+    found = [*filter(videos.is_video, inside)]
     return found[0] if len(found) == 1 else source
 
 

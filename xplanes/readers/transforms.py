@@ -29,6 +29,7 @@ from xplanes.readers.entries import (
 )
 from xplanes.readers.formats import read_header
 from xplanes.readers.listing import Calibration, Listing, time_source
+from xplanes.readers.masks import Meaning
 from xplanes.readers.name_times import times_in_names
 from xplanes.readers.transforms_lenses import OTHER_LENSES, PIXELS, read_calibration
 from xplanes.scenes.cameras import focal_length
@@ -94,11 +95,14 @@ TIMELESS = (
 )
 """How to give other times than the numbers in names."""
 
-BESIDE = {
-    "ignored": ["dynamic_mask_{stem}.png"],
+BESIDE: dict[Meaning, list[str]] = {
+    "ignore": ["dynamic_mask_{stem}.png"],
     "alpha": ["{stem}.alpha{suffix}", "{stem}{suffix}.alpha{suffix}"],
 }
 """Names of mask files beside an image, by their meaning."""
+
+Masks = tuple[list[Path | None], Meaning | None]
+"""A mask file for each image, or none, and their meaning if the source defines it."""
 
 
 def readable(paths: Sequence[Path]) -> dict[Path, dict[str, Any]]:
@@ -122,9 +126,6 @@ def numbers(contents: Mapping[Path, Mapping[str, Any]]) -> dict[str, float]:
 
     Images that are missing do not count: programs list cameras that were never rendered. Empty if
     a frame has a time, or if names have no number that varies.
-
-    Args:
-        contents: Result of `readable`.
     """
     images: dict[str, str] = {}
     for path, content in contents.items():
@@ -139,16 +140,9 @@ def numbers(contents: Mapping[Path, Mapping[str, Any]]) -> dict[str, float]:
     return dict(zip(images, found, strict=True)) if found else {}
 
 
-def all_masks(contents: Mapping[Path, Mapping[str, Any]]) -> tuple[list[Path | None], str]:
-    """Masks of the usable images in several transforms files, and their meaning.
-
-    Args:
-        contents: Result of `readable`.
-
-    Returns:
-        As ``masks`` and ``mask_meaning`` of `Listing`.
-    """
-    masks, meaning = [], ""
+def all_masks(contents: Mapping[Path, Mapping[str, Any]]) -> Masks:
+    """``masks`` and ``mask_meaning``, as of `Listing`, of the usable images in several files."""
+    masks, meaning = [], None
     for path, content in contents.items():
         pairs = []
         for entry in content["frames"]:
@@ -224,10 +218,7 @@ class _Frame(NamedTuple):
 
 
 def _usable(path: Path, content: Mapping[str, Any], folder: Path) -> list[_Frame]:
-    """Usable frames; warns about those without image, finite pose, or time if most have one.
-
-    A frame that is listed again, equal in all its keys, is left out, too.
-    """
+    """Frames, but for repeated ones and those without image, finite pose, or time if most have."""
     entries = content["frames"]
     key = _time_key(entries)
     timed = sum(entry.get(key) is not None for entry in entries)
@@ -315,10 +306,10 @@ def _warn_of_selection(path: Path, content: Mapping[str, Any]) -> None:
         )
 
 
-def _masks(pairs: Sequence[tuple[Path, Path | None]]) -> tuple[list[Path | None], str]:
+def _masks(pairs: Sequence[tuple[Path, Path | None]]) -> Masks:
     """Masks of images, or else those beside them with instant-ngp's names, and their meaning."""
     if any(mask for _, mask in pairs):
-        return [mask for _, mask in pairs], ""
+        return [mask for _, mask in pairs], None
     for meaning, patterns in BESIDE.items():
         found = [
             next((mask for name in names if (mask := path.with_name(name)).is_file()), None)
@@ -327,7 +318,7 @@ def _masks(pairs: Sequence[tuple[Path, Path | None]]) -> tuple[list[Path | None]
         ]
         if any(found):
             return found, meaning
-    return [], ""
+    return [], None
 
 
 def _warn_of_rays(path: Path, images: Sequence[Path]) -> None:
@@ -408,13 +399,9 @@ def _with_height(camera: Calibration, keys: Mapping[str, Any], image: Path) -> C
 
 def warn_of_unknown(path: Path, content: Mapping[str, Any], unread: Sequence[str] = ()) -> None:
     """Warn about unknown and unread keys, which may affect images or cameras."""
-    entries = (content, *content["frames"])
-    given = {
-        key
-        for each in entries
-        for key, value in each.items()
-        if _has_content(value) or "color" in key  # Zeros in a colour mean black.
-    }
+    items = [item for each in (content, *content["frames"]) for item in each.items()]
+    # Zeros in a colour mean black.
+    given = {key for key, value in items if _has_content(value) or "color" in key}
     if unknown := sorted(given - ({*KNOWN, *IGNORED} - {*unread})):
         other = " data=nerfstudio reads times, masks and splits." if {*unread} & {*unknown} else ""
         warn(
@@ -429,11 +416,7 @@ def _has_content(value: Any) -> bool:
 
 
 def _standard(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
-    """The keys in standard form: strings as values, and alternative intrinsics by standard keys.
-
-    Fields of view are converted to radians. instant-ngp's x_fov, which takes precedence over focal
-    lengths, and its converter's fovx are in degrees.
-    """
+    """The keys in standard form: strings as values, and alternative intrinsics by standard keys."""
     found = dict(keys)
     for key in {*ALIASES} & {*keys}:
         if is_positive(number_in(str(keys[key]))):
@@ -453,6 +436,7 @@ def _standard(path: Path, keys: dict[str, Any]) -> dict[str, Any]:
             (fl_x, _, cx), (_, fl_y, cy) = matrix[:2, :3].tolist()
             found = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy} | found
             del found[key]  # Other values get the warning about unknown keys.
+    # instant-ngp's x_fov precedes focal lengths; it and its converter's fovx are in degrees.
     for axis in "xy":
         angle, name = found.get(f"{axis}_fov"), f"camera_angle_{axis}"
         if is_positive(angle):

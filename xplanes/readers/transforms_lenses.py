@@ -47,13 +47,7 @@ SYNONYMS = {"sx1": "s1", "sy1": "s3"}
 def read_calibration(
     where: str, content: Mapping[str, Any], label: str, frame: Mapping[str, Any]
 ) -> Calibration:
-    """The camera of a frame: from its own keys, else from those of the file.
-
-    Args:
-        where: The file, for messages.
-        content: Content of the file.
-        label: The file and frame, for messages.
-        frame: Content of the frame.
+    """The camera of a frame: from its own keys, else from those of the content of the file.
 
     Raises:
         SceneError: If a key is missing or out of range, or the lens is not supported.
@@ -107,8 +101,8 @@ def _pixels(name: str, keys: Mapping[str, Any]) -> dict[str, float]:
 
 def _lens(
     where: str, content: Mapping[str, Any], label: str, frame: Mapping[str, Any]
-) -> tuple[LensModel, tuple[float, ...]]:
-    """The kind of lens of a frame, and its distortion; empty if it has none."""
+) -> tuple[LensModel, dict[str, float]]:
+    """The kind of lens of a frame, and its distortion."""
     model, name, found = LensModel.PERSPECTIVE, "", {}
     for source, keys in ((where, content), (label, frame)):
         for key, value in keys.items():
@@ -141,12 +135,11 @@ def _lens(
                 f'{label}: the camera_model FOV needs "omega" between 0 and pi radians, not '
                 f"{omega:g}. Correct it, or set camera_model to PINHOLE."
             )
-        return model, (omega,)
+        return model, {"k1": omega}
     rational = name == "FULL_OPENCV" or found.get("k5") or found.get("k6")
     if model == LensModel.PERSPECTIVE and found.get("k4") and not rational:
         model = LensModel.POLYNOMIAL
-    distortion = tuple(found.get(key, 0.0) for key in COEFFICIENTS)
-    return model, distortion if any(distortion) else ()
+    return model, {key: found[key] for key in COEFFICIENTS if key in found}
 
 
 def _listed_distortion(source: str, keys: Mapping[str, Any]) -> Mapping[str, Any]:

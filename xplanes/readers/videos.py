@@ -19,6 +19,11 @@ HDR = {16: "PQ", 18: "HLG"}
 """Transfer characteristics of HDR videos, by their numbers in ITU-T H.273."""
 
 
+def is_video(path: Path) -> bool:
+    """Whether a file is named like a video."""
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+
+
 def read_header(path: Path) -> tuple[Size, int, float | None, tuple[float, ...]]:
     """Read the header of a video file. Nothing is decoded.
 

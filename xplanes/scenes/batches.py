@@ -190,14 +190,7 @@ class ViewSettings(BatchSettings):
 
 
 class ViewBatches(Batches):
-    """Draws whole training views in random order, all of them once before any is repeated.
-
-    Args:
-        views: Training views.
-        settings: The settings, with the background colour.
-        seed: The run's seed.
-        rank: Rank of this process in a distributed run.
-    """
+    """Draws whole training views in random order, all of them once before any is repeated."""
 
     skipped = 0.0
 
@@ -247,13 +240,6 @@ class RayBatches(Batches):
     consecutive pixels, so that it reads from few places on the disk; pixels of a kind remain
     equally likely. Near and far are distinguished more coarsely there (`RunPools`).
 
-    Args:
-        views: Training views.
-        frame: The field's frame, in which rays are returned.
-        settings: The settings.
-        seed: The run's seed.
-        rank: Rank of this process among the processes that split the rays.
-
     Attributes:
         slopes: Whether batches have ``across``, the change of each ray's direction by one pixel to
             the right and down, [R, 2, 3], and ``slopes``, the change of the target colour per pixel
@@ -292,14 +278,13 @@ class RayBatches(Batches):
         uniform_far, uniform_textureless = self.far_pixels / pixels, textureless_pixels / pixels
         skip = settings.skip_background and self.near_pixels > 0
         share = settings.background_share if changes is None else STATIC_SHARE
-        self.far_share = min(share, uniform_far) if skip else uniform_far
-        self.textureless_share = (
-            min(TEXTURELESS_SHARE, uniform_textureless) if skip else uniform_textureless
-        )
+        most_far, most_textureless = (share, TEXTURELESS_SHARE) if skip else (1.0, 1.0)
+        self.far_share = min(most_far, uniform_far)
+        textureless_share = min(most_textureless, uniform_textureless)
         jitter = skip and uniform_far > 0 and not views.is_static and changes is None
         self.background_jitter = settings.background_jitter if jitter else 0.0
-        self.skipped = uniform_far + uniform_textureless - self.far_share - self.textureless_share
-        self.pools.share(self.far_share, self.textureless_share)
+        self.skipped = uniform_far + uniform_textureless - self.far_share - textureless_share
+        self.pools.share(self.far_share, textureless_share)
 
     def add_slopes(self) -> None:
         if isinstance(self.views.images, StoredImages):
@@ -310,12 +295,7 @@ class RayBatches(Batches):
         self.slopes = True
 
     def draw(self, step: int, rays: int | None = None, errors: Tensor | None = None) -> Batch:
-        """The batch of a step.
-
-        Args:
-            step: Its number.
-            rays: Number of rays to draw; the maximum when None.
-            errors: As in `Batches.draw`; unused without `tiles`.
+        """The batch of a step, see `Batches.draw`; errors are unused without `tiles`.
 
         Returns:
             ``origins`` and unit ``directions`` in the field's frame [R, 3], ``times`` [R],

@@ -225,15 +225,7 @@ class Sight:
 
 
 def sight(lens: Lenses, focal: Tensor, centre: Tensor, height: int, width: int) -> Sight:
-    """Field of view of an image through its lens.
-
-    Args:
-        lens: The lens.
-        focal: Focal lengths along x and y in pixels. [2]
-        centre: Principal point in pixels. [2]
-        height: Rows.
-        width: Columns.
-    """
+    """Field of view of an image through its lens; focal lengths and centre are in pixels. [2]"""
 
     def unproject(columns: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         y = (rows.double() - centre[1]) / focal[1]
@@ -256,11 +248,8 @@ def sight(lens: Lenses, focal: Tensor, centre: Tensor, height: int, width: int) 
     half_x, half_y = (
         min(0.5 * float(pair.sum()), 0.5 * WIDEST) for pair in (angles[:2], angles[2:])
     )
-    return Sight(
-        has_ray,
-        _stretch(lens, local),
-        (0.5 * width / math.tan(half_x), 0.5 * height / math.tan(half_y)),
-    )
+    pinhole = 0.5 * width / math.tan(half_x), 0.5 * height / math.tan(half_y)
+    return Sight(has_ray, _stretch(lens, local), pinhole)
 
 
 def _stretch(lens: Lenses, border: Tensor) -> float:

@@ -38,15 +38,9 @@ MOST_VIEWS = 5
 """Most views in the window: more would cut off moving content and carve away little else."""
 
 
-def foreground(views: Views, margin: int | Sequence[int]) -> Tensor:
-    """Pixels within ``margin`` pixels of the silhouettes. bool [V, H, W]
-
-    Args:
-        views: Images; their padding is never foreground.
-        margin: One for all images, or one for each.
-    """
+def foreground(views: Views, margins: Sequence[int]) -> Tensor:
+    """Pixels within each image's margin of its silhouette, but for padding. bool [V, H, W]"""
     near = torch.zeros(views.images.shape[:3], dtype=torch.bool)
-    margins = [margin] * len(views) if isinstance(margin, int) else margin
     for index, reach in enumerate(margins):
         shown = views.silhouette(index)
         near[index, : shown.shape[0], : shown.shape[1]] = widened(shown, reach)
@@ -274,13 +268,11 @@ def _images_of_bin(bins: Tensor, place: int) -> Tensor:
 
 
 def _halved_changes(views: Views, frames: list[int]) -> tuple[Tensor | None, Tensor]:
-    """Squares of four pixels that are shown, and those that differ from their median over time.
+    """Squares of four pixels that are shown, None if all, and those that differ from their median.
 
-    Averages are compared: they are less noisy and still show lines of one pixel.
-
-    Returns:
-        bool [F, h / 2, w / 2] each, rounded up; the first is None if all pixels are shown.
+    bool [F, h / 2, w / 2] each, rounded up
     """
+    # Averages are less noisy and still show lines of one pixel.
     images = []
     for index in frames:
         image = views.image(index)[..., :3].permute(2, 0, 1).contiguous().float()

@@ -312,11 +312,7 @@ def images(
 
 
 def in_memory(sizes: Sequence[Size], jobs: Sequence[Job]) -> Tensor:
-    """Decode images to one tensor, padded with zeros at the bottom and on the right.
-
-    Args:
-        sizes: Height and width of each image. [V]
-        jobs: Each decodes some of the images, in a thread.
+    """Decode images to one tensor, padded with zeros at the bottom and on the right, see `images`.
 
     Returns:
         Premultiplied colour and alpha. uint8 [V, H, W, 4]
@@ -358,15 +354,10 @@ def _write(path: Path, sizes: Sequence[Size], channels: int, jobs: Sequence[Job]
     from tqdm import tqdm
 
     first, lock = _firsts(sizes), threading.Lock()
+    how = {"unit": "image", "leave": False, "disable": not sys.stderr.isatty()}
     with (
         path.open("r+b", buffering=0) as file,
-        tqdm(
-            total=len(sizes),
-            desc="decoding",
-            unit="image",
-            leave=False,
-            disable=not sys.stderr.isatty(),
-        ) as bar,
+        tqdm(total=len(sizes), desc="decoding", **how) as bar,
     ):
         file.truncate(_length(sizes, channels))
 

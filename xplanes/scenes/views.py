@@ -111,13 +111,8 @@ class Intrinsics:
             return None
         known: dict[tuple[float, ...], Sight] = {}
         lenses, found = self.lenses, []
-        numbers = torch.cat(
-            [
-                *(self.focal, self.centre, self.size, lenses.model[:, None]),
-                *(lenses.coefficients, lenses.skew[:, None]),
-            ],
-            dim=1,
-        )
+        places = self.focal, self.centre, self.size, lenses.model[:, None]
+        numbers = torch.cat([*places, lenses.coefficients, lenses.skew[:, None]], dim=1)
         for index, key in enumerate(map(tuple, numbers.tolist())):
             if key not in known:
                 height, width = self.size[index].tolist()
@@ -228,12 +223,8 @@ class Views:
     @property
     def is_partial(self) -> bool:
         """Whether some pixels are left out: padding, pixels without a ray, and ignored ones."""
-        sights = self.intrinsics.sights or []
-        return (
-            self.is_padded
-            or self.ignored is not None
-            or any(each.has_ray is not None for each in sights)
-        )
+        masks = [self.ignored, *(each.has_ray for each in self.intrinsics.sights or [])]
+        return self.is_padded or any(mask is not None for mask in masks)
 
     @cached_property
     def is_opaque(self) -> bool:

@@ -65,16 +65,16 @@ def test_cast_equals_the_nearest_of_all_parts():
 
 
 def test_hits_bound_the_inside():
-    assembly = small_assembly()
+    posed = small_assembly().pose(0.6)
     origins, directions = float_rays(3000, seed=1)
-    distance = assembly.cast(origins, directions, 0.6).distance
+    distance = posed.cast(origins, directions).distance
     found = distance.isfinite()
     beyond = origins + (distance + 1e-3)[:, None] * directions
     before = origins + (distance - 1e-3)[:, None] * directions
-    assert not assembly.inside(before[found], 0.6).any()
-    assert assembly.inside(beyond[found], 0.6).float().mean() > 0.97
-    gap, _ = assembly.pose(0.6).signed_distance(beyond[found])
-    assert torch.equal(gap < 0, assembly.inside(beyond[found], 0.6))
+    assert not posed.inside(before[found]).any()
+    inside = posed.inside(beyond[found])
+    assert inside.float().mean() > 0.97
+    assert torch.equal(posed.signed_distance(beyond[found])[0] < 0, inside)
 
 
 @settings(max_examples=25, deadline=None)
@@ -151,9 +151,9 @@ def test_light_is_lambert_with_shadows():
     origins = torch.tensor([[-0.95, 0.0, 0.1], [0.9, 0.0, 1.0]])
     directions = torch.tensor([[0.95, 0.0, -0.1], [0.0, 0.0, -1.0]])
     directions = directions / directions.norm(dim=-1, keepdim=True)
-    lit = Assembly((floor,), light=light).cast(origins, directions, 0)
+    lit = Assembly((floor,), light=light).pose(0).cast(origins, directions)
     assert torch.allclose(lit.colour, torch.full((2, 3), 0.7), atol=1e-5)
-    shaded = Assembly((floor, ball), light=light).cast(origins, directions, 0)
+    shaded = Assembly((floor, ball), light=light).pose(0).cast(origins, directions)
     assert shaded.part.tolist() == [0, 0]
     expected = torch.tensor([0.2, 0.7])[:, None].expand(2, 3)
     assert torch.allclose(shaded.colour, expected, atol=1e-5)

@@ -22,6 +22,7 @@ from xplanes.synthetic.pretraining.pool import (
     ensure_pool,
     inside,
 )
+from xplanes.synthetic.pretraining.settings import BatchSettings
 
 VIEW = CanonicalView(OPENLRM_VIEW.rotation, 2.9, FOCAL, 1.0, 1.0)
 
@@ -104,7 +105,8 @@ def test_records_tell_the_truth():
 
 def batches(pool, **other):
     counts = {"objects": 3, "near": 200, "volume": 100, "free": 100, "colour": 50, "rays": 60}
-    return PretrainingBatches(pool, VIEW, seed=3, **{**counts, **other})
+    settings = BatchSettings(**{**counts, "samples": 8, **other})
+    return PretrainingBatches(pool, VIEW, settings, seed=3)
 
 
 def test_batches_depend_on_seed_and_step_alone():

@@ -137,9 +137,7 @@ def module(*overrides):
 
 def test_losses_fall():
     config, taught = module("schedule.muon_lr=0.02", "schedule.adam_lr=0.01")
-    counts = ("objects", "near", "volume", "free", "colour", "rays")
-    counts = {name: getattr(config.batch, name) for name in counts}
-    data = PretrainingBatches(small_pool(3), taught.model.view, seed=0, **counts)
+    data = PretrainingBatches(small_pool(3), taught.model.view, config.batch, seed=0)
     loss, parts = taught.losses(data.draw(0))
     first, options = float(loss.detach()), config.schedule
     parts = {name: float(value) for name, value in parts.items()}

@@ -130,10 +130,6 @@ class Gaussians(Representation):
         return self._moves
 
     @property
-    def precision(self) -> str:
-        return "32"
-
-    @property
     def outline(self) -> str:
         return f"{len(self):,} Gaussians"
 
@@ -231,24 +227,17 @@ class HexPlaneGaussians(Gaussians):
 
     Args:
         cloud: See `Gaussians`.
-        degree: See `Gaussians`.
-        extent: See `Gaussians`.
         planes: The planes; None for a static scene.
         width: Neurons of the hidden layers.
+        canonical: Other arguments of `Gaussians`.
 
     Source: 4D-GS (Wu et al. 2024), Section 4.
     """
 
     def __init__(
-        self,
-        cloud: PointCloud,
-        *,
-        degree: int,
-        extent: float,
-        planes: PlaneProducts | None,
-        width: int,
+        self, cloud: PointCloud, *, planes: PlaneProducts | None, width: int, **canonical: Any
     ) -> None:
-        super().__init__(cloud, degree=degree, extent=extent, moves=planes is not None)
+        super().__init__(cloud, **canonical, moves=planes is not None)
         self.products = planes
         self.network = nn.ModuleDict()
         if planes is not None:
@@ -286,14 +275,12 @@ class DeformedGaussians(Gaussians):
 
     Args:
         cloud: See `Gaussians`.
-        degree: See `Gaussians`.
-        extent: See `Gaussians`.
-        moves: See `Gaussians`.
         depth: Number of hidden layers; the encoded input is concatenated after the middle one.
         width: Neurons of the hidden layers.
         octaves: Frequencies of the encodings of positions and times.
         noise: Initial standard deviation of the noise on time.
         noise_until: Share of training over which the noise fades to 0.
+        canonical: Other arguments of `Gaussians`.
 
     Source: Deformable 3D Gaussians (Yang et al. 2024), Section 3, and its released code.
     """
@@ -302,19 +289,17 @@ class DeformedGaussians(Gaussians):
         self,
         cloud: PointCloud,
         *,
-        degree: int,
-        extent: float,
-        moves: bool,
         depth: int,
         width: int,
         octaves: tuple[int, int],
         noise: float = 0.0,
         noise_until: float = 0.0,
+        **canonical: Any,
     ) -> None:
-        super().__init__(cloud, degree=degree, extent=extent, moves=moves)
+        super().__init__(cloud, **canonical)
         self.octaves, self.noise, self.noise_until = octaves, noise, noise_until
         self.network = nn.ModuleDict()
-        if moves:
+        if self.moves:
             of_place, of_time = 3 * (1 + 2 * octaves[0]), 1 + 2 * octaves[1]
             inputs, self._entry = of_place + TIME_FEATURES, depth // 2 + 1
             self.network["time"] = layers([of_time, width, TIME_FEATURES])
@@ -324,10 +309,6 @@ class DeformedGaussians(Gaussians):
             self.network["hidden"] = nn.ModuleList(nn.Linear(count, width) for count in columns)
             for name, outputs in HEADS.items():
                 self.network[name] = _still(width, outputs)
-
-    @property
-    def planes(self) -> Mapping[str, Tensor]:
-        return {}
 
     def moved(self, canonical: PosedGaussians, time: float) -> PosedGaussians:
         places = octaves(self.means.detach(), self.octaves[0])
@@ -364,10 +345,8 @@ class SpacetimeGaussians(Gaussians):
 
     Args:
         cloud: See `Gaussians`; its times are the initial centres, which are random without times.
-        degree: See `Gaussians`.
-        extent: See `Gaussians`.
-        moves: See `Gaussians`.
         width: Initial width of the radial basis; the whole sequence has length 1.
+        canonical: Other arguments of `Gaussians`.
 
     Source: Spacetime Gaussians (Li et al. 2024), Section 4.1, in its lite version: without the
     network after the rasteriser.
@@ -375,21 +354,15 @@ class SpacetimeGaussians(Gaussians):
 
     PARAMETERS = (*Gaussians.PARAMETERS, "centres", "log_widths", "motion", "spin")
 
-    def __init__(
-        self, cloud: PointCloud, *, degree: int, extent: float, moves: bool, width: float
-    ) -> None:
-        super().__init__(cloud, degree=degree, extent=extent, moves=moves)
+    def __init__(self, cloud: PointCloud, *, width: float, **canonical: Any) -> None:
+        super().__init__(cloud, **canonical)
         count = len(cloud.points)
         centres = torch.rand(count) if cloud.times is None else cloud.times.clone()
         self.centres = nn.Parameter(centres)
         self.log_widths = nn.Parameter(torch.full((count,), math.log(width)))
         self.motion = nn.Parameter(torch.zeros(count, ORDER, 3))
         self.spin = nn.Parameter(torch.zeros(count, 4))
-        self.deforms.fill_(moves)
-
-    @property
-    def planes(self) -> Mapping[str, Tensor]:
-        return {}
+        self.deforms.fill_(self.moves)
 
     def moved(self, canonical: PosedGaussians, time: float) -> PosedGaussians:
         since = time - self.centres

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -73,6 +73,11 @@ class GaussiansSettings(ModelSettings):
                 f"count={self.count}: must not be above densify.most={self.densify.most}"
             )
 
+    def canonical(self, site: Site, initial: InitialValues | None) -> dict[str, Any]:
+        """Arguments of all fields: initial points, degree, and extent of the cameras."""
+        cloud = self.first_points(site, initial)
+        return {"cloud": cloud, "degree": self.degree, "extent": camera_extent(site)}
+
     def first_points(self, site: Site, initial: InitialValues | None) -> PointCloud:
         """Points from which the Gaussians are initialised, drawn with torch's global generator."""
         if isinstance(initial, InitialPoints):
@@ -84,7 +89,11 @@ class GaussiansSettings(ModelSettings):
         return random_points(self.count)
 
 
-class GaussiansModel(Model):
+S = TypeVar("S", bound=GaussiansSettings)
+F = TypeVar("F", bound=Gaussians)
+
+
+class GaussiansModel(Model, Generic[S, F]):
     """Absolute colour error and dissimilarity (1 - SSIM), and adaptive density control.
 
     Args:
@@ -92,36 +101,43 @@ class GaussiansModel(Model):
         field: The Gaussians.
     """
 
-    static_share = 0.0
-    """Share of the budget before anything moves."""
+    doubted = "mean_lr"
+    """Learning rate that is to be lowered when the loss is not finite."""
 
-    def __init__(self, settings: GaussiansSettings, field: Gaussians) -> None:
-        self._field, self._settings = field, settings
-        self.advice = (
-            f"Lower model.scale_lr={settings.scale_lr} or model.mean_lr={settings.mean_lr}"
-        )
+    def __init__(self, settings: S, field: F) -> None:
+        self._field, self.settings = field, settings
+        rate = getattr(settings, self.doubted)
+        self.advice = f"Lower model.scale_lr={settings.scale_lr} or model.{self.doubted}={rate}"
 
     @property
-    def field(self) -> Gaussians:
+    def field(self) -> F:
         return self._field
 
     @property
-    def replaces_parameters(self) -> bool:
-        return self._settings.densify.until > 0
+    def static_share(self) -> float:
+        """Share of the budget before anything moves."""
+        return getattr(self.settings, "static_share", 0.0)
 
-    def groups(self) -> list[Group]:
-        settings, field = self._settings, self._field
-        rates = {
-            "means": settings.mean_lr * float(field.extent),
+    @property
+    def replaces_parameters(self) -> bool:
+        return self.settings.densify.until > 0
+
+    def rates(self) -> dict[str, float]:
+        """Learning rates of the tensors with one row per Gaussian."""
+        settings = self.settings
+        return {
+            "means": settings.mean_lr * float(self._field.extent),
             "quaternions": settings.rotation_lr,
             "log_scales": settings.scale_lr,
             "logits": settings.opacity_lr,
             "base": settings.colour_lr,
             "detail": settings.colour_lr / 20,
         }
+
+    def groups(self) -> list[Group]:
         return [
-            {"params": [getattr(field, name)], "lr": rate, "name": name}
-            for name, rate in rates.items()
+            {"params": [getattr(self._field, name)], "lr": rate, "name": name}
+            for name, rate in self.rates().items()
         ]
 
     def rate_factor(self, step: int, progress: float) -> float:
@@ -129,10 +145,10 @@ class GaussiansModel(Model):
 
     def group_rate_factor(self, group: str, step: int, progress: float) -> float:
         """Exponential decay of the means' learning rate."""
-        return self._settings.final_lr**progress if group == "means" else 1.0
+        return self.settings.final_lr**progress if group == "means" else 1.0
 
     def before_step(self, state: TrainingState, optimizer: torch.optim.Optimizer) -> None:
-        settings, field, step = self._settings, self._field, state.step
+        settings, field, step = self.settings, self._field, state.step
         field.degree.fill_(min(settings.degree, step // settings.degree_every))
         if field.moves and not field.deforms and state.progress >= self.static_share:
             field.deforms.fill_(True)
@@ -154,7 +170,7 @@ class GaussiansModel(Model):
         return
 
     def losses(self, rendering: Any, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
-        share, target = self._settings.loss.dissimilarity, rays["target"]
+        share, target = self.settings.loss.dissimilarity, rays["target"]
         colour = rendering.colour
         if (shown := rays.get("shown")) is not None:  # Ignored pixels have no error.
             colour = torch.where(shown[:, None], colour, target)

@@ -128,10 +128,6 @@ class Tensor4D(SurfaceField):
         return self.flow is not None
 
     @property
-    def precision(self) -> str:
-        return "32"
-
-    @property
     def outline(self) -> str:
         sizes = "/".join(str(level.resolution) for level in self.canonical_planes.levels)
         return f"(surface and flow, planes of {sizes})"
@@ -249,10 +245,6 @@ class Tensor4DDensity(ViewDependentField):
     @property
     def moves(self) -> bool:
         return any("t" in name for group in self.field_planes.groups for name in group)
-
-    @property
-    def precision(self) -> str:
-        return "32"
 
     @property
     def outline(self) -> str:

@@ -102,7 +102,10 @@ class PretrainingModule(LightningModule):
     def training_step(self, batch: PretrainingBatch, batch_idx: int) -> None:
         optimizers = self.optimizers()
         assert isinstance(optimizers, list)
-        self._set_learning_rates()
+        peaks = self.schedule.muon_lr, self.schedule.adam_lr
+        for optimizer, peak in zip(optimizers, peaks, strict=True):
+            for group in optimizer.param_groups:
+                group["lr"] = self.rate * peak
         loss, parts = self.losses(batch)
         self.manual_backward(loss)
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.schedule.clip)
@@ -145,13 +148,8 @@ class PretrainingModule(LightningModule):
         shape = (*batch.ray_hits.shape, self.batch.samples)
         random = step_generator(self.seed, self.steps, Stream.PRETRAINING, planes.device)
         jitter = torch.rand(shape, generator=random, device=planes.device)
-        distances, lengths = ray_samples(
-            batch.origins,
-            batch.directions,
-            batch.ray_hits,
-            half_side=self.model.half_side,
-            jitter=jitter,
-        )
+        rays = (batch.origins, batch.directions, batch.ray_hits)
+        distances, lengths = ray_samples(*rays, half_side=self.model.half_side, jitter=jitter)
         points = batch.origins[:, :, None] + distances[..., None] * batch.directions[:, :, None]
         with torch.autocast(planes.device.type, torch.bfloat16, enabled=self.bf16):
             logits = triplane_logits(planes, self.model.decoder, points.flatten(1, 2))
@@ -164,15 +162,6 @@ class PretrainingModule(LightningModule):
         warm = min(1.0, (self.steps + 1) / max(1, self.schedule.warmup_steps))
         left = (1 - self.progress) / max(self.schedule.decay_share, 1e-9)
         return warm * min(1.0, left)
-
-    def _set_learning_rates(self) -> None:
-        optimizers = self.optimizers()
-        assert isinstance(optimizers, list)
-        for optimizer, peak in zip(
-            optimizers, (self.schedule.muon_lr, self.schedule.adam_lr), strict=True
-        ):
-            for group in optimizer.param_groups:
-                group["lr"] = self.rate * peak
 
     def _refuse(self, loss: float, norm: float) -> None:
         self.unusable += 1
@@ -187,8 +176,8 @@ class PretrainingModule(LightningModule):
         checkpoint["progress"] = {"steps": self.steps, "clock": self.clock}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        self.steps = checkpoint["progress"]["steps"]
-        self.clock = checkpoint["progress"]["clock"]
+        progress = checkpoint["progress"]
+        self.steps, self.clock = progress["steps"], progress["clock"]
 
 
 LONGEST = 10.0

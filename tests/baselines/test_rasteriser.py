@@ -16,6 +16,7 @@ from xplanes.baselines.gaussians import rasteriser_cuda
 from xplanes.baselines.gaussians.camera import Camera
 from xplanes.baselines.gaussians.harmonics import spherical_harmonics
 from xplanes.baselines.gaussians.rasteriser import GaussianError, rasterise
+from xplanes.baselines.gaussians.reference import Splats
 from xplanes.optional import MissingExtraError
 from xplanes.scenes.cameras import camera_around
 
@@ -304,7 +305,7 @@ def test_spherical_harmonics_are_those_of_legendre(degree):
 def test_cuda_says_what_brings_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(MissingExtraError, match=r"xplanes\[gaussians\]"):
-        rasteriser_cuda.draw(*(t.float() for t in gaussians(3)), camera_of(), False)
+        rasteriser_cuda.draw(Splats(*gaussians(3)), camera_of(), False)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

@@ -6,8 +6,6 @@ and do not depend on the number of threads. This module is imported only when ne
 takes a second to load.
 """
 
-# ruff: noqa: D103 (rasteriser.py documents these loops)
-
 import numpy as np
 from numba import prange
 
@@ -627,17 +625,8 @@ def blend_backward(
                     sums[MOMENTS + entry] = 0
                 if member < last:
                     begin, end = _rows(geometry, m, top)
-                    _blend_one_backward(
-                        flat,
-                        begin,
-                        end,
-                        member,
-                        geometry,
-                        features,
-                        m,
-                        group,
-                        sums,
-                    )
+                    gaussian = geometry, features, m, group
+                    _blend_one_backward(flat, begin, end, member, *gaussian, sums)
                 for entry in range(MOMENTS):
                     partial[slot, entry] = sums[entry]
                 for entry in range(GROUP):

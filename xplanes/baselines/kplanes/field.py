@@ -127,9 +127,8 @@ class KPlanes(ViewDependentField):
 
     @property
     def outline(self) -> str:
-        sizes = "/".join(
-            str(plane.shape[3]) for name, plane in self.products.planes() if name == "xy"
-        )
+        planes = self.products.planes()
+        sizes = "/".join(str(plane.shape[3]) for name, plane in planes if name == "xy")
         space = " over contracted space" if self.contracted else ""
         names = " ".join(self.products.names)
         return f"({names}, {sizes}{space}) · {self.products.channels} channels"

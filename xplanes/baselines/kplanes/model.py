@@ -3,19 +3,11 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
-import torch
-
 from xplanes.baselines.kplanes.field import ExplicitDecoder, HybridDecoder, KPlanes
 from xplanes.baselines.products import PlaneProducts, PlaneTerms, Variation
 from xplanes.errors import ConfigError
 from xplanes.models.base import InitialValues, Model, ModelSettings, warm_cosine
-from xplanes.rendering.sampler import (
-    Group,
-    Site,
-    fits_origin_cube,
-    origin_cube,
-    seen_range,
-)
+from xplanes.rendering.sampler import Group, Site, fits_origin_cube, origin_cube, seen_range
 from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame, scene_frame
 from xplanes.scenes.views import Views
 from xplanes.settings import Count, Positive, Settings, Steps, Weight
@@ -101,10 +93,7 @@ class KPlanesModel(Model):
 
     def __init__(self, settings: KPlanesSettings, field: KPlanes) -> None:
         self._field, self.settings = field, settings
-        loss = settings.loss
-        self.terms = PlaneTerms(
-            loss.total_variation, loss.variation, loss.time_smoothness, loss.time_identity
-        )
+        self.terms = PlaneTerms.of(settings.loss)
         self.advice = f"Lower model.learning_rate={settings.learning_rate}"
 
     @property
@@ -124,7 +113,5 @@ class KPlanesModel(Model):
     def regularise(self, state: TrainingState) -> None:
         self.terms.add_gradients(self._field.products)
 
-    @torch.no_grad()
     def regularisers(self, state: TrainingState) -> dict[str, float]:
-        values = self.terms.values(self._field.products)
-        return {name: getattr(self.terms, name) * float(value) for name, value in values.items()}
+        return self.terms.weighted(self._field.products)

@@ -191,15 +191,12 @@ class Tensor4DModel(Tensor4DDensityModel):
             "silhouette": weights.opacity * silhouette_error(rendering.opacity, mask),
         }
         if weights.smoothness:
-            change = self._change(rendering, len(mask), state)
+            places, features = rendering.places, self._field.features
+            nearby = places + _aside(places, weights.smoothness_distance, state)
+            shares = rendering.weights, len(mask)
+            change = feature_change(features(places), features(nearby), *shares)
             terms["smoothness"] = weights.smoothness * change
         return terms
-
-    def _change(self, rendering: SurfaceRendering, rays: int, state: TrainingState) -> Tensor:
-        places = rendering.places
-        nearby = places + _aside(places, self.weights.smoothness_distance, state)
-        here, there = self._field.features(places), self._field.features(nearby)
-        return feature_change(here, there, rendering.weights, rays)
 
     def scalars(self) -> dict[str, float]:
         return {"surface/sharpness": float(self._field.sharpness.detach())}

@@ -8,13 +8,12 @@ from torch import Tensor
 
 from xplanes.baselines.proposal import dense_samples
 from xplanes.baselines.resampling import resample
+from xplanes.baselines.stateless import StatelessSampler
 from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
-from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
-from xplanes.scenes.batches import Batch
+from xplanes.rendering.sampler import SamplerSettings, Site
 from xplanes.settings import Count, Positive
-from xplanes.streams import TrainingState
 
 TINY = 1e-5
 """Added to denominators and weights that may be 0."""
@@ -183,7 +182,7 @@ class NeusSettings(SamplerSettings):
                 "model/sampler=occupancy or proposal"
             )
 
-    def build(self, field: RadianceField, site: Site) -> "NeusSampler":
+    def build(self, field: RadianceField, site: Site) -> StatelessSampler:
         self.require(field)
         renderer = NeusRenderer(
             field,
@@ -191,33 +190,5 @@ class NeusSettings(SamplerSettings):
             more=self.more_samples,
             coarse_sharpness=self.coarse_sharpness,
         )
-        return NeusSampler(renderer)
-
-
-class NeusSampler(Sampler):
-    """Places samples by the field's signed distance; it has no state to update.
-
-    Args:
-        renderer: The renderer.
-    """
-
-    def __init__(self, renderer: NeusRenderer) -> None:
-        self._renderer = renderer
-
-    @property
-    def renderer(self) -> NeusRenderer:
-        return self._renderer
-
-    @property
-    def outline(self) -> str:
-        return f"{self._renderer.samples} samples a ray, {self._renderer.more} near the surface"
-
-    def render(self, field: Any, rays: Batch, state: TrainingState) -> SurfaceRendering:
-        return self._renderer.render(
-            field,
-            rays["origins"],
-            rays["directions"],
-            rays["times"],
-            rays["background"],
-            rays["jitter"],
-        )
+        outline = f"{self.samples} samples a ray, {self.more_samples} near the surface"
+        return StatelessSampler(renderer, outline)

@@ -7,16 +7,15 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from xplanes.baselines.stateless import StatelessSampler
 from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.behind import behind
 from xplanes.rendering.compositing import composite
 from xplanes.rendering.marching import Samples
-from xplanes.rendering.sampler import Sampler, SamplerSettings, Site, check_range
-from xplanes.scenes.batches import Batch
+from xplanes.rendering.sampler import SamplerSettings, Site, check_range
 from xplanes.settings import Positive, Range, Weight
-from xplanes.streams import TrainingState
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,8 @@ class FixedStepRendering(Rendering):
 class FixedStepRenderer(RayRenderer):
     """Places samples at equal distances along a ray, from where it enters the field's box.
 
-    Samples with an opacity or weight up to a threshold are dropped and get no colour.
+    They are not jittered. Those with an opacity or weight up to a threshold are dropped and get no
+    colour.
 
     Args:
         field: Field with ``bounds``, ``cell``, ``geometry`` and ``colour``.
@@ -68,7 +68,7 @@ class FixedStepRenderer(RayRenderer):
         directions: Tensor,
         times: Tensor,
         background: Tensor,
-        jitter: None = None,
+        jitter: Any = None,
     ) -> FixedStepRendering:
         step = self.step * field.cell
         box = field.bounds()
@@ -170,7 +170,7 @@ class FixedStepSettings(SamplerSettings):
     def bounded(self, near: float, far: float) -> "FixedStepSettings":
         return replace(self, near=near, far=far)
 
-    def build(self, field: RadianceField, site: Site) -> "FixedStepSampler":
+    def build(self, field: RadianceField, site: Site) -> StatelessSampler:
         self.require(field)
         check_range(site, self.near, self.far)
         renderer = FixedStepRenderer(
@@ -180,28 +180,5 @@ class FixedStepSettings(SamplerSettings):
             step=self.step,
             threshold=self.threshold,
         )
-        return FixedStepSampler(renderer)
-
-
-class FixedStepSampler(Sampler):
-    """Places samples at fixed steps, without jitter; it has no state to update.
-
-    Args:
-        renderer: The renderer.
-    """
-
-    def __init__(self, renderer: FixedStepRenderer) -> None:
-        self._renderer = renderer
-
-    @property
-    def renderer(self) -> FixedStepRenderer:
-        return self._renderer
-
-    @property
-    def outline(self) -> str:
-        return f"samples {self._renderer.step:g} cells apart throughout the field's box"
-
-    def render(self, field: Any, rays: Batch, state: TrainingState) -> FixedStepRendering:
-        return self._renderer.render(
-            field, rays["origins"], rays["directions"], rays["times"], rays["background"]
-        )
+        outline = f"samples {self.step:g} cells apart throughout the field's box"
+        return StatelessSampler(renderer, outline)

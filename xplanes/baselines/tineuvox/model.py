@@ -84,18 +84,17 @@ class TiNeuVoxSettings(ModelSettings):
 
     def build(self, site: Site, initial: InitialValues | None = None) -> "TiNeuVoxModel":
         assert site.bounds is not None
+        octaves = (
+            *(self.point_octaves, self.time_octaves),
+            *(self.direction_octaves, self.feature_octaves),
+        )
         with initial_values(site.seed, Stream.FIELD):
             field = TiNeuVox(
                 site.bounds,
                 self.resolution,
                 self.channels,
                 self.width,
-                octaves=(
-                    self.point_octaves,
-                    self.time_octaves,
-                    self.direction_octaves,
-                    self.feature_octaves,
-                ),
+                octaves=octaves,
                 alpha=self.alpha_start,
                 halvings=len(self.grow_at),
                 moves=site.moves,
@@ -133,14 +132,8 @@ class TiNeuVoxModel(Model):
 
     def groups(self) -> list[Group]:
         settings, field = self.settings, self._field
-        groups: list[Group] = [
-            {
-                "params": [field.grid],
-                "lr": settings.grid_learning_rate,
-                "name": "grid",
-                "masked": True,
-            }
-        ]
+        grid = {"params": [field.grid], "lr": settings.grid_learning_rate, "masked": True}
+        groups: list[Group] = [grid | {"name": "grid"}]
         for name, part in field.named_children():
             if part is field.background:
                 continue
@@ -179,9 +172,8 @@ class TiNeuVoxModel(Model):
             "entropy": self.weights.entropy * light_entropy(rendering.opacity),
         }
         if isinstance(rendering, FixedStepRendering):
-            spread = sample_colour_error(
-                rendering.colours, rays["target"], rendering.weights, rendering.ray
-            )
+            samples = rendering.weights, rendering.ray
+            spread = sample_colour_error(rendering.colours, rays["target"], *samples)
             terms["sample_colour"] = self.weights.sample_colour * spread
         if self._field.background is not None and self.settings.background is not None:
             terms |= self.settings.background.losses(self._field.background, rendering, rays, state)

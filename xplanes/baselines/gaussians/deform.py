@@ -55,7 +55,7 @@ class DeformedGaussiansSettings(GaussiansSettings):
 class DeformedGaussiansModel(GaussiansModel[DeformedGaussiansSettings, DeformedGaussians]):
     """Colour errors and adaptive density control."""
 
-    doubted = "network_lr"
+    doubted = ("scale_lr", "network_lr")
 
     def groups(self) -> list[Group]:
         groups, network = super().groups(), list(self._field.network.parameters())

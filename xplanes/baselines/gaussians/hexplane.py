@@ -66,7 +66,7 @@ class HexPlaneGaussiansSettings(GaussiansSettings):
 class HexPlaneGaussiansModel(GaussiansModel[HexPlaneGaussiansSettings, HexPlaneGaussians]):
     """Colour errors, smoothness of planes, and adaptive density control."""
 
-    doubted = "plane_lr"
+    doubted = ("scale_lr", "plane_lr")
 
     def groups(self) -> list[Group]:
         settings, field, groups = self.settings, self._field, super().groups()

@@ -2,18 +2,19 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
+from xplanes.baselines.base import BaselineModel
 from xplanes.baselines.gaussians.densification import DensifySettings, densify, reset_opacity
 from xplanes.baselines.gaussians.field import Gaussians, PointCloud
 from xplanes.baselines.gaussians.harmonics import MAX_DEGREE
 from xplanes.baselines.gaussians.hull import hull_points, random_points
 from xplanes.errors import ConfigError
 from xplanes.metrics import dissimilarity
-from xplanes.models.base import InitialValues, Model, ModelSettings
+from xplanes.models.base import InitialValues, ModelSettings
 from xplanes.rendering.sampler import Group, Site
 from xplanes.scenes.batches import Batch, ViewSettings
 from xplanes.settings import Count, Positive, Settings, Share, Steps
@@ -93,25 +94,10 @@ S = TypeVar("S", bound=GaussiansSettings)
 F = TypeVar("F", bound=Gaussians)
 
 
-class GaussiansModel(Model, Generic[S, F]):
-    """Absolute colour error and dissimilarity (1 - SSIM), and adaptive density control.
+class GaussiansModel(BaselineModel[S, F]):
+    """Absolute colour error and dissimilarity (1 - SSIM), and adaptive density control."""
 
-    Args:
-        settings: Learning rates, schedule and weights.
-        field: The Gaussians.
-    """
-
-    doubted = "mean_lr"
-    """Learning rate that is to be lowered when the loss is not finite."""
-
-    def __init__(self, settings: S, field: F) -> None:
-        self._field, self.settings = field, settings
-        rate = getattr(settings, self.doubted)
-        self.advice = f"Lower model.scale_lr={settings.scale_lr} or model.{self.doubted}={rate}"
-
-    @property
-    def field(self) -> F:
-        return self._field
+    doubted = ("scale_lr", "mean_lr")
 
     @property
     def static_share(self) -> float:

@@ -185,6 +185,7 @@ def project_backward(
     d_scales,
     d_opacities,
 ):
+    """Gradients of `project`, from those of its outputs."""
     fx, fy = camera[12], camera[13]
     for n in prange(len(means)):
         for axis in range(3):
@@ -625,8 +626,9 @@ def blend_backward(
                     sums[MOMENTS + entry] = 0
                 if member < last:
                     begin, end = _rows(geometry, m, top)
-                    gaussian = geometry, features, m, group
-                    _blend_one_backward(flat, begin, end, member, *gaussian, sums)
+                    _blend_one_backward(
+                        flat, begin, end, member, geometry, features, m, group, sums
+                    )
                 for entry in range(MOMENTS):
                     partial[slot, entry] = sums[entry]
                 for entry in range(GROUP):

@@ -3,10 +3,11 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
+from xplanes.baselines.base import BaselineModel
 from xplanes.baselines.kplanes.field import ExplicitDecoder, HybridDecoder, KPlanes
 from xplanes.baselines.products import PlaneProducts, PlaneTerms, Variation
 from xplanes.errors import ConfigError
-from xplanes.models.base import InitialValues, Model, ModelSettings, warm_cosine
+from xplanes.models.base import InitialValues, ModelSettings, warm_cosine
 from xplanes.rendering.sampler import Group, Site, fits_origin_cube, origin_cube, seen_range
 from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame, scene_frame
 from xplanes.scenes.views import Views
@@ -83,22 +84,14 @@ class KPlanesSettings(ModelSettings):
         return KPlanesModel(self, KPlanes(products, decode, site.unit, contracted=contracted))
 
 
-class KPlanesModel(Model):
-    """Colour error, smoothness of the planes, and distance of time planes from 1.
+class KPlanesModel(BaselineModel[KPlanesSettings, KPlanes]):
+    """Colour error, smoothness of the planes, and distance of time planes from 1."""
 
-    Args:
-        settings: Learning rate and weights.
-        field: The field.
-    """
+    doubted = ("learning_rate",)
 
     def __init__(self, settings: KPlanesSettings, field: KPlanes) -> None:
-        self._field, self.settings = field, settings
+        super().__init__(settings, field)
         self.terms = PlaneTerms.of(settings.loss)
-        self.advice = f"Lower model.learning_rate={settings.learning_rate}"
-
-    @property
-    def field(self) -> KPlanes:
-        return self._field
 
     def groups(self) -> list[Group]:
         rate = self.settings.learning_rate

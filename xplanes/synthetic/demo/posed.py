@@ -45,10 +45,6 @@ class PosedPart:
         own = directions @ self.rotation.to(directions)
         return self.shape.hit(self.to_own(origins), own) * self.scale
 
-    def signed_distance(self, points: Tensor) -> Tensor:
-        """Distance of world points to the part, negative inside. [N]"""
-        return self.shape.signed_distance(self.to_own(points)) * self.scale
-
     def inside(self, points: Tensor) -> Tensor:
         """Whether world points lie inside the part. bool [N]"""
         return self.shape.inside(self.to_own(points))
@@ -203,29 +199,6 @@ class Posed:
         result = torch.zeros(len(points), dtype=torch.bool, device=points.device)
         for part in self.parts:
             result |= part.inside(points)
-        return result
-
-    def signed_distance(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance to the nearest part, and that part's index. [N], [N]"""
-        distance, part = torch.stack([p.signed_distance(points) for p in self.parts]).min(dim=0)
-        return distance, part
-
-    def colour(self, points: Tensor, part: Tensor | None = None) -> Tensor:
-        """Unlit colours.
-
-        Args:
-            points: Positions. [N, 3]
-            part: Index of the part at each point; the nearest part when None. [N]
-
-        Returns:
-            Colours in [0, 1]. [N, 3]
-        """
-        if part is None:
-            part = self.signed_distance(points)[1]
-        result = torch.zeros_like(points)
-        for number in part.unique().tolist():
-            chosen = (part == number).nonzero()[:, 0]
-            result[chosen] = self.parts[number].colour(points[chosen])
         return result
 
     def bounds(self) -> tuple[Tensor, Tensor]:

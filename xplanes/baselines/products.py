@@ -81,6 +81,11 @@ class PlaneProducts(nn.Module):
         """Name and parameter of every plane, scale by scale. [1, C, rows, columns] each"""
         return [(name, scale[name]) for scale in self.scales for name in self.names]  # type: ignore[index]
 
+    @property
+    def finest(self) -> dict[str, Tensor]:
+        """The planes of the finest scale. [C, rows, columns] each"""
+        return {name: plane[0] for name, plane in self.planes()[-len(self.names) :]}
+
     def forward(self, points: Tensor, times: Tensor) -> Tensor:
         """Features of points at times.
 

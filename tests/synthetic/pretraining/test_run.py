@@ -11,16 +11,12 @@ import torch
 
 from tests.synthetic.pretraining.small import OVERRIDES, same, small_config, small_pool, small_sizes
 from xplanes.cli import main
+from xplanes.errors import ConfigError
 from xplanes.locks import alone_in
 from xplanes.lrm import load
 from xplanes.synthetic.pretraining import pool as pool_module
 from xplanes.synthetic.pretraining.initialisation import init_model
-from xplanes.synthetic.pretraining.module import (
-    PATIENCE,
-    PretrainingError,
-    PretrainingModule,
-    Upkeep,
-)
+from xplanes.synthetic.pretraining.module import PATIENCE, PretrainingModule, Upkeep
 from xplanes.synthetic.pretraining.pool import PretrainingBatches
 from xplanes.synthetic.pretraining.run import CHECKPOINT
 
@@ -178,7 +174,7 @@ def test_what_is_not_finite_changes_no_weight_and_ends_training_with_a_message(m
     monkeypatch.setattr(taught, "losses", broken)
     for step in range(PATIENCE - 1):
         taught.training_step(None, step)  # type: ignore[arg-type]
-    with pytest.raises(PretrainingError, match=r"schedule\.muon_lr"):
+    with pytest.raises(ConfigError, match=r"schedule\.muon_lr"):
         taught.training_step(None, PATIENCE)  # type: ignore[arg-type]
     assert taught.steps == 0
     assert torch.equal(first, start)

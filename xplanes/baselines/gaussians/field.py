@@ -4,7 +4,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -96,9 +96,7 @@ class Gaussians(Representation):
     Source: Kerbl et al. 2023, released code.
     """
 
-    PARAMETERS: ClassVar[tuple[str, ...]] = (
-        *("means", "quaternions", "log_scales", "logits", "base", "detail"),
-    )
+    PARAMETERS: tuple[str, ...] = ("means", "quaternions", "log_scales", "logits", "base", "detail")
     STATISTICS = ("slopes", "seen")
 
     def __init__(self, cloud: PointCloud, *, degree: int, extent: float, moves: bool) -> None:
@@ -118,6 +116,7 @@ class Gaussians(Representation):
         self.register_buffer("degree", torch.tensor(0))
         self.register_buffer("deforms", torch.tensor(False))
         self.register_buffer("extent", torch.tensor(extent))
+        self.register_load_state_dict_pre_hook(_fit_rows)
 
     slopes: Tensor
     seen: Tensor
@@ -177,38 +176,22 @@ class Gaussians(Representation):
 
     def at(self, time: float) -> PosedGaussians:
         """The Gaussians at a time from 0 to 1; gradients reach the parameters."""
-        canonical = PosedGaussians(
-            self.means,
-            self.quaternions,
-            self.scales,
-            self.opacities,
-            torch.cat([self.base, self.detail], dim=1),
-            int(self.degree),
-        )
+        harmonics = torch.cat([self.base, self.detail], dim=1)
+        shape = self.means, self.quaternions, self.scales
+        canonical = PosedGaussians(*shape, self.opacities, harmonics, int(self.degree))
         return self.moved(canonical, time) if self.moves and self.deforms else canonical
 
     def training_time(self, time: float, state: TrainingState) -> float:
         """The time at which a view is rendered in training; subclasses may add noise."""
         return time
 
-    def _load_from_state_dict(
-        self,
-        state_dict: Any,
-        prefix: str,
-        local_metadata: Any,
-        strict: bool,
-        missing_keys: list[str],
-        unexpected_keys: list[str],
-        error_msgs: list[str],
-    ) -> None:
-        count = len(state_dict.get(f"{prefix}means", self.means))
-        if count != len(self):
-            for tensor in self.rows.values():
-                tensor.data = tensor.new_zeros(count, *tensor.shape[1:])
-        super()._load_from_state_dict(
-            *(state_dict, prefix, local_metadata, strict),
-            *(missing_keys, unexpected_keys, error_msgs),
-        )
+
+def _fit_rows(field: Gaussians, state: Mapping[str, Any], prefix: str, *_rest: Any) -> None:
+    """Resize the rows to the number of Gaussians of the state."""
+    count = len(state.get(f"{prefix}means", field.means))
+    if count != len(field):
+        for tensor in field.rows.values():
+            tensor.data = tensor.new_zeros(count, *tensor.shape[1:])
 
 
 class MaskedGaussians(Masked):
@@ -249,11 +232,7 @@ class HexPlaneGaussians(Gaussians):
 
     @property
     def planes(self) -> Mapping[str, Tensor]:
-        """The planes of the finest scale. [C, rows, columns] each"""
-        if self.products is None:
-            return {}
-        names = self.products.names
-        return {name: plane[0] for name, plane in self.products.planes()[-len(names) :]}
+        return {} if self.products is None else self.products.finest
 
     def moved(self, canonical: PosedGaussians, time: float) -> PosedGaussians:
         assert self.products is not None

@@ -113,9 +113,7 @@ class KPlanes(ViewDependentField):
 
     @property
     def planes(self) -> Mapping[str, Tensor]:
-        """The planes of the finest scale. [C, rows, columns] each"""
-        names = self.products.names
-        return {name: plane[0] for name, plane in self.products.planes()[-len(names) :]}
+        return self.products.finest
 
     @property
     def moves(self) -> bool:

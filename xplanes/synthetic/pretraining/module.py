@@ -33,10 +33,6 @@ PATIENCE = 20
 """Consecutive steps with a non-finite loss after which training stops."""
 
 
-class PretrainingError(ConfigError):
-    """Pretraining cannot continue; the message names the problem and the settings to change."""
-
-
 class PretrainingModule(LightningModule):
     """Trains a model on procedural objects with known occupancy and colour.
 
@@ -166,7 +162,7 @@ class PretrainingModule(LightningModule):
     def _refuse(self, loss: float, norm: float) -> None:
         self.unusable += 1
         if self.unusable >= PATIENCE:
-            raise PretrainingError(
+            raise ConfigError(
                 f"the loss was {loss} and its gradient's norm {norm} for {PATIENCE} steps in a "
                 f"row, at step {self.steps}: lower schedule.muon_lr={self.schedule.muon_lr} and "
                 f"schedule.adam_lr={self.schedule.adam_lr}, and begin again"

@@ -9,6 +9,7 @@ import torch
 from tests.baselines.runs import under
 from xplanes.components import read_settings
 from xplanes.config import compose_plain
+from xplanes.lrm.canonical import OPENLRM_VIEW, CanonicalView
 from xplanes.lrm.config import parse_config
 from xplanes.synthetic.pretraining.pool import FOCAL, Pool, draw_sample
 from xplanes.synthetic.pretraining.settings import PretrainingSettings, published_sizes
@@ -21,6 +22,7 @@ OVERRIDES = (
     *under("schedule", max_seconds="null", warmup_steps=2, render_from=0.5, score_objects=2),
 )
 SIDE = 24
+VIEW = CanonicalView(OPENLRM_VIEW.rotation, 2.9, FOCAL, 1.0, 1.0)
 
 
 @functools.cache

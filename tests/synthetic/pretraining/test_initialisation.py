@@ -119,9 +119,3 @@ def test_settings_that_cannot_work_are_refused_by_name():
         plain[section] |= change
         read = partial(read_settings, PretrainingSettings, plain)
         assert_refused(ConfigError, message, read, change)
-    for override, message in (
-        ("batch.object=3", "batch.object"),
-        ("pretrain=huge", "huge"),
-        ("seed=some", "seed"),
-    ):
-        assert_refused(ConfigError, message, partial(small_config, override), override)

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from tests.refusals import flip
-from tests.synthetic.pretraining.small import SIDE, same, small_pool
+from tests.synthetic.pretraining.small import SIDE, VIEW, same, small_pool
 from xplanes.errors import ConfigError
-from xplanes.lrm.canonical import OPENLRM_VIEW, CanonicalView
 from xplanes.streams import step_generator
 from xplanes.synthetic.pretraining import pool as pool_module
 from xplanes.synthetic.pretraining.objects import TRAINING_SEEDS, procedural_object
@@ -23,8 +22,6 @@ from xplanes.synthetic.pretraining.pool import (
     inside,
 )
 from xplanes.synthetic.pretraining.settings import BatchSettings
-
-VIEW = CanonicalView(OPENLRM_VIEW.rotation, 2.9, FOCAL, 1.0, 1.0)
 
 
 @pytest.fixture

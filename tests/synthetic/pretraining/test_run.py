@@ -178,8 +178,3 @@ def test_what_is_not_finite_changes_no_weight_and_ends_training_with_a_message(m
         taught.training_step(None, PATIENCE)  # type: ignore[arg-type]
     assert taught.steps == 0
     assert torch.equal(first, start)
-
-
-def test_invalid_settings_end_the_command_with_a_message(capsys):
-    assert main(["pretrain-lrm", "batch.objects=0"]) == 1
-    assert "batch.objects=0" in capsys.readouterr().err

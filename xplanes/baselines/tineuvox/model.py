@@ -120,8 +120,8 @@ class TiNeuVoxModel(BaselineModel[TiNeuVoxSettings, TiNeuVox]):
 
     def groups(self) -> list[Group]:
         settings, field = self.settings, self._field
-        grid = {"params": [field.grid], "lr": settings.grid_learning_rate, "masked": True}
-        groups: list[Group] = [grid | {"name": "grid"}]
+        grid = {"params": [field.grid], "lr": settings.grid_learning_rate, "name": "grid"}
+        groups: list[Group] = [grid | {"masked": True}]
         for name, part in field.named_children():
             if part is field.background:
                 continue

@@ -115,7 +115,11 @@ class ProposalRenderer(RayRenderer):
 
         Samples are stratified by ``jitter``; if ``learn``, gradients reach the density fields, too.
         """
-        near, far = (bound[:, None] for bound in self._range(origins, directions))
+        if self.near is None or self.far is None:
+            bounds = ray_box(origins, directions)
+        else:
+            bounds = (torch.full_like(origins[:, 0], bound) for bound in (self.near, self.far))
+        near, far = (bound[:, None] for bound in bounds)
         levels: list[Level] = []
 
         def placed(count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -152,12 +156,6 @@ class ProposalRenderer(RayRenderer):
             samples=samples,
             levels=tuple(levels),
         )
-
-    def _range(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        if self.near is None or self.far is None:
-            return ray_box(origins, directions)
-        ones = torch.ones_like(origins[:, 0])
-        return self.near * ones, self.far * ones
 
     def _edges(
         self, levels: Sequence[Level], near: Tensor, count: int, jitter: torch.Generator | None

@@ -75,19 +75,19 @@ class GaussiansSettings(ModelSettings):
             )
 
     def canonical(self, site: Site, initial: InitialValues | None) -> dict[str, Any]:
-        """Arguments of all fields: initial points, degree, and extent of the cameras."""
-        cloud = self.first_points(site, initial)
-        return {"cloud": cloud, "degree": self.degree, "extent": camera_extent(site)}
+        """Arguments of all fields: initial points, degree, and extent of the cameras.
 
-    def first_points(self, site: Site, initial: InitialValues | None) -> PointCloud:
-        """Points from which the Gaussians are initialised, drawn with torch's global generator."""
+        Points are drawn with torch's global generator.
+        """
         if isinstance(initial, InitialPoints):
-            return initial.cloud
-        if site.views is None:
-            return random_points(1)  # The Gaussians are loaded from a checkpoint.
-        if self.points == "silhouettes":
-            return hull_points(site.views, site.frame, self.count)
-        return random_points(self.count)
+            cloud = initial.cloud
+        elif site.views is None:
+            cloud = random_points(1)  # The Gaussians are loaded from a checkpoint.
+        elif self.points == "silhouettes":
+            cloud = hull_points(site.views, site.frame, self.count)
+        else:
+            cloud = random_points(self.count)
+        return {"cloud": cloud, "degree": self.degree, "extent": camera_extent(site)}
 
 
 S = TypeVar("S", bound=GaussiansSettings)

@@ -81,8 +81,15 @@ def _demo_shoot(name: str, seed: int, counts: dict[str, int]) -> Shoot:
     assembly = build_demo_scene(name, seed)
     # Parts and motions are hashed, so that an edited scene is rendered again.
     record = {"assembly": _digest(assembly)}
-    capture = _demo_capture(name, seed, counts)
-    return Shoot(f"demo scene {name}", assembly, capture, VERSION, record)
+    shots = {}
+    for split, count in counts.items():
+        draw = random.Random(f"{split} {seed}")  # A stream for each split.
+        cameras = hemisphere_cameras(count, draw)
+        times = even_times(count) if split == "train" else held_out_times(count, draw)
+        shots[split] = list(zip(times, cameras, strict=True))
+    camera = camera_at(demo_scene(name).azimuth, 0.0)
+    shots["video"] = [(time, camera) for time in even_times(VIDEO_FRAMES)]
+    return Shoot(f"demo scene {name}", assembly, Capture(shots), VERSION, record)
 
 
 def _suite_shoot(name: str, seed: int, counts: dict[str, int]) -> Shoot:
@@ -149,7 +156,9 @@ def ensure_demo_scene(
     total = sum(views.values())
     (announce or print)(f"Rendering {made.title} ({total} images of {resolution} px) to {folder}")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    _clear_unfinished(folder)
+    for path in folder.parent.glob(f".{folder.name}.*"):  # Abandoned by other processes.
+        if now() - path.stat().st_mtime > DAY:
+            shutil.rmtree(path, ignore_errors=True)
     fresh = _sibling(folder)
     try:
         # Parallelising many small operations in torch costs more than it gains.
@@ -169,19 +178,6 @@ ensure_suite_scene = partial(ensure_demo_scene, shoot=_suite_shoot)
 There is no fixed-view video. Objects with surroundings have opaque images, and masks of the object
 in ``masks``. Only scores may use these masks, unless ``mask_use`` says otherwise.
 """
-
-
-def _demo_capture(name: str, seed: int, counts: dict[str, int]) -> Capture:
-    """Times and cameras of a demo scene; each split has its own random stream."""
-    shots = {}
-    for split, count in counts.items():
-        draw = random.Random(f"{split} {seed}")
-        cameras = hemisphere_cameras(count, draw)
-        times = even_times(count) if split == "train" else held_out_times(count, draw)
-        shots[split] = list(zip(times, cameras, strict=True))
-    camera = camera_at(demo_scene(name).azimuth, 0.0)
-    shots["video"] = [(time, camera) for time in even_times(VIDEO_FRAMES)]
-    return Capture(shots)
 
 
 def _write_split(folder: Path, split: str, shoot: Shoot, resolution: int) -> None:
@@ -228,13 +224,6 @@ def _sibling(folder: Path) -> Path:
     sibling = folder.with_name(f".{folder.name}.{os.getpid()}.{secrets.token_hex(4)}")
     sibling.mkdir()
     return sibling
-
-
-def _clear_unfinished(folder: Path) -> None:
-    """Remove abandoned temporary folders next to ``folder``."""
-    for path in folder.parent.glob(f".{folder.name}.*"):
-        if now() - path.stat().st_mtime > DAY:
-            shutil.rmtree(path, ignore_errors=True)
 
 
 def _publish(fresh: Path, folder: Path, record: dict[str, Any], masked: bool) -> None:

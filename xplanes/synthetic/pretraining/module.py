@@ -111,8 +111,15 @@ class PretrainingModule(LightningModule):
                 optimizer.step()
             optimizer.zero_grad()
         if not usable:
-            self._refuse(float(loss.detach()), float(norm))
-            return
+            self.unusable += 1
+            if self.unusable < PATIENCE:
+                return
+            raise ConfigError(
+                f"the loss was {float(loss.detach())} and its gradient's norm {float(norm)} for "
+                f"{PATIENCE} steps in a row, at step {self.steps}: lower schedule.muon_lr="
+                f"{self.schedule.muon_lr} and schedule.adam_lr={self.schedule.adam_lr}, and begin "
+                "again"
+            )
         self.unusable = 0
         self.steps += 1
         keep = min(self.schedule.average, (1 + self.steps) / (10 + self.steps))
@@ -158,15 +165,6 @@ class PretrainingModule(LightningModule):
         warm = min(1.0, (self.steps + 1) / max(1, self.schedule.warmup_steps))
         left = (1 - self.progress) / max(self.schedule.decay_share, 1e-9)
         return warm * min(1.0, left)
-
-    def _refuse(self, loss: float, norm: float) -> None:
-        self.unusable += 1
-        if self.unusable >= PATIENCE:
-            raise ConfigError(
-                f"the loss was {loss} and its gradient's norm {norm} for {PATIENCE} steps in a "
-                f"row, at step {self.steps}: lower schedule.muon_lr={self.schedule.muon_lr} and "
-                f"schedule.adam_lr={self.schedule.adam_lr}, and begin again"
-            )
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["progress"] = {"steps": self.steps, "clock": self.clock}

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from tests.balls import ball_scene, ball_views
+from tests.baselines.gaussian_oracle import rotated
 from tests.baselines.runs import under
 from tests.training.runs import changed
 from xplanes.baselines.gaussians.densification import densify, reset_opacity, select_rows
@@ -135,15 +136,9 @@ def test_halves_are_drawn_from_the_gaussian_that_is_split():
     rules = control(most=100_000)
     densify(field, stepped(field), rules, torch.Generator().manual_seed(2), remove_large=False)
     assert len(field) == 8000
-    # By quaternion products, as Hamilton has them.
-    w, *axis = torch.nn.functional.normalize(quaternion, dim=0).double()
-    axis = torch.stack(axis)
-    turned = []
-    for unit in torch.eye(3, dtype=torch.float64):
-        cross = 2 * torch.linalg.cross(axis, unit)
-        turned.append(unit + w * cross + torch.linalg.cross(axis, cross))
+    turned = np.stack([rotated(quaternion.double().numpy(), unit) for unit in np.eye(3)])
     offsets = (field.means.detach() - centre).double()
-    along = offsets @ torch.stack(turned).T / scales
+    along = offsets @ torch.from_numpy(turned).T / scales
     assert along.mean(dim=0).abs().max() < 0.05
     assert (along.std(dim=0) - 1).abs().max() < 0.05
     assert (torch.corrcoef(along.T) - torch.eye(3)).abs().max() < 0.05

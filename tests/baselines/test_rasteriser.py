@@ -16,6 +16,7 @@ from xplanes.baselines.gaussians import rasteriser_cuda
 from xplanes.baselines.gaussians.camera import Camera
 from xplanes.baselines.gaussians.harmonics import spherical_harmonics
 from xplanes.baselines.gaussians.rasteriser import GaussianError, rasterise
+from xplanes.baselines.gaussians.reference import Splats
 from xplanes.optional import MissingExtraError
 from xplanes.scenes.cameras import camera_around
 
@@ -77,15 +78,13 @@ def close(ours, theirs, most):
         assert worst <= most, f"error {worst:.1e} of {scale:.1e}"
 
 
-def upstream(*outputs):
-    """Gradients of colour, opacity and depth, the same for the same sizes."""
-    draw = torch.Generator().manual_seed(5)
-    return [torch.randn(t.shape, generator=draw, dtype=torch.float64) for t in outputs]
-
-
-def back(image):
-    outputs = (image.colour, image.opacity, image.depth)
-    sum((t * w.to(t)).sum() for t, w in zip(outputs, upstream(*outputs), strict=True)).backward()
+def weighed(image):
+    """A loss of colour, opacity and depth, with the same weights for the same sizes."""
+    draw, total = torch.Generator().manual_seed(5), 0
+    for output in (image.colour, image.opacity, image.depth):
+        weights = torch.randn(output.shape, generator=draw, dtype=torch.float64)
+        total = total + (output * weights.to(output)).sum()
+    return total
 
 
 @pytest.mark.parametrize("kind", KINDS, indirect=True)
@@ -112,16 +111,14 @@ def test_gradients_of_plain_torch_are_slopes_of_its_values(kind, channels, antia
     background = torch.linspace(0.2, 1, channels, dtype=torch.float64)
 
     def loss(*given, camera):
-        image = rasterise(*given, camera, background=background, antialiased=antialiased)
-        outputs = (image.colour, image.opacity, image.depth)
-        return sum((t * w).sum() for t, w in zip(outputs, upstream(*outputs), strict=True))
+        return weighed(rasterise(*given, camera, background=background, antialiased=antialiased))
 
     given, camera = gaussians(5, seed=3, channels=channels, size=0.3), camera_of()
     leaves = [t.requires_grad_() for t in given]
     seen = functools.partial(loss, camera=camera)
     assert torch.autograd.gradcheck(seen, leaves, atol=1e-6, rtol=1e-6)
     image, _ = drawn(kind, given, camera, background=background, antialiased=antialiased)
-    back(image)
+    weighed(image).backward()
     # Moving the principal point moves all projected means alike, and nothing else.
     for axis, name in enumerate(("cx", "cy")):
         ends = [getattr(camera, name) + step for step in (1e-6, -1e-6)]
@@ -137,7 +134,7 @@ def test_loops_and_plain_torch_agree_on_many_gaussians(monkeypatch, antialiased,
         monkeypatch.setenv("XPLANES_CPU_LOOPS", str(int(kind == "loops")))
         given = at_float32(gaussians(1500, size=0.04, channels=channels))
         image, leaves = drawn(kind, given, camera_of(90, 75), **options)
-        back(image)
+        weighed(image).backward()
         gradients = [image.means2d.grad, *(t.grad for t in leaves)]
         found.append([image.colour, image.opacity, image.depth, image.radii, *gradients])
     for ours, theirs in zip(*found, strict=True):
@@ -150,7 +147,7 @@ def test_the_same_bits_on_any_number_of_threads(monkeypatch):
     for count in (1, 2, 2):
         with threads(count):
             image, given = drawn("loops", gaussians(800, size=0.05), camera_of(100, 80))
-            back(image)
+            weighed(image).backward()
         tensors = (image.colour, image.opacity, image.depth, image.means2d.grad)
         found.append([*tensors, *(t.grad for t in given)])
     for first, *others in zip(*found, strict=True):
@@ -186,7 +183,7 @@ def test_points_needles_discs_and_giants(kind, scale):
         most = max(TOLERANCE[kind], 1e-6 if antialiased else 0)
         close(image.opacity, expected[1], most)
         close(image.colour, expected[0], most)
-        back(image)
+        weighed(image).backward()
         assert all(leaf.grad.isfinite().all() for leaf in leaves)
 
 
@@ -199,7 +196,7 @@ def test_thousands_of_layers_stop_at_the_cut_off(kind):
     close(image.opacity, expected[1], 10 * TOLERANCE[kind])
     close(image.colour, expected[0], 10 * TOLERANCE[kind])
     assert (1 - image.opacity > 0.9e-4).all()
-    back(image)
+    weighed(image).backward()
     # Behind the cut-off nothing is seen, and nothing is learnt.
     assert (leaves[4].grad[-500:] == 0).all()
     assert (leaves[4].grad[:500] != 0).all()
@@ -232,9 +229,9 @@ def test_what_is_not_seen_changes_nothing(kind, change):
     seen = single(camera)
     both = [torch.cat(pair) for pair in zip(seen, single(camera, **change), strict=True)]
     alone, given = drawn(kind, seen, camera)
-    back(alone)
+    weighed(alone).backward()
     image, leaves = drawn(kind, both, camera)
-    back(image)
+    weighed(image).backward()
     assert torch.equal(alone.colour, image.colour)
     assert image.radii.tolist() == [*alone.radii.tolist(), 0]
     for leaf, lone in zip(leaves, given, strict=True):
@@ -304,7 +301,7 @@ def test_spherical_harmonics_are_those_of_legendre(degree):
 def test_cuda_says_what_brings_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(MissingExtraError, match=r"xplanes\[gaussians\]"):
-        rasteriser_cuda.draw(*(t.float() for t in gaussians(3)), camera_of(), False)
+        rasteriser_cuda.draw(Splats(*gaussians(3)), camera_of(), False)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -317,7 +314,7 @@ def test_gsplat_draws_what_plain_torch_draws(antialiased):
         leaves = [t.to(device, dtype).requires_grad_() for t in given]
         image = rasterise(*leaves, camera, antialiased=antialiased)
         image.means2d.retain_grad()
-        back(image)
+        weighed(image).backward()
         tensors = (image.colour, image.opacity, image.depth, image.means2d.grad)
         found.append([t.detach().cpu() for t in (*tensors, *(t.grad for t in leaves))])
     for ours, theirs in zip(*found, strict=True):

@@ -84,22 +84,6 @@ def test_a_fixed_view_is_rendered_by_rays(scenes):
         rendering_method(method, ball_views(4, 0.6))
 
 
-def test_losses_of_another_model_and_those_that_lack_terms_are_refused(scenes):
-    configs = {m: baseline_config(scenes, f"model={m}") for m in ("kplanes", "six_planes")}
-    losses = {model: config["model"]["loss"] for model, config in configs.items()}
-    for model, other, problem in (
-        ("kplanes", "six_planes", ": there is no such setting"),
-        ("six_planes", "kplanes", ", floaters.*: they are not set"),
-    ):
-        configs[model]["model"]["loss"] = losses[other]
-        with pytest.raises(ConfigError, match=rf"model\.loss\.opacity{problem}"):
-            Experiment.read(configs[model])
-    config = baseline_config(scenes, "model=tensor4d")
-    del config["model"]["loss"]["eikonal"]
-    with pytest.raises(ConfigError, match=r"model\.loss\.eikonal: it is not set"):
-        Experiment.read(config)
-
-
 def settings_of(scenes, *overrides):
     return Method.read(baseline_config(scenes, *overrides)).model
 
@@ -160,10 +144,8 @@ def test_tineuvox_rates_and_cells_follow_the_published_schedule(scenes):
 
 
 def tensor4d(scenes, *overrides):
-    settings, views = (
-        settings_of(scenes, "model=tensor4d", *TENSOR4D, *overrides),
-        ball_views(4, 0.6),
-    )
+    settings = settings_of(scenes, "model=tensor4d", *TENSOR4D, *overrides)
+    views = ball_views(4, 0.6)
     frame = settings.frame(views)
     assert frame.scale == scene_frame(views).scale
     return settings.build(Site(frame, views.times, 0, "32"))

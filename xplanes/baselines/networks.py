@@ -105,16 +105,12 @@ class PaddedMLP(nn.Module):
         bf16 = self.precision == "bf16"
         with torch.autocast(values.device.type, torch.bfloat16, enabled=bf16):
             first = self.weights[0]
+            weight, padding = first[:, : self.inputs], first[:, self.inputs :]
             hidden = half_rows(values) if bf16 else values
-            hidden = F.linear(hidden, first[:, : self.inputs], self._bias(first))
+            hidden = F.linear(hidden, weight, padding.sum(dim=1) if padding.shape[1] else None)
             for weight in self.weights[1:]:
                 hidden = F.linear(hidden.relu() if self.activation else hidden, weight)
         return hidden[: len(values)].float() if bf16 else hidden
-
-    def _bias(self, first: Tensor) -> Tensor | None:
-        if first.shape[1] == self.inputs:
-            return None
-        return first[:, self.inputs :].sum(dim=1)
 
 
 def _round_up(width: int) -> int:

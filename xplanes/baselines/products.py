@@ -3,7 +3,7 @@
 import functools
 import importlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import torch
@@ -81,15 +81,15 @@ class PlaneProducts(nn.Module):
         """Name and parameter of every plane, scale by scale. [1, C, rows, columns] each"""
         return [(name, scale[name]) for scale in self.scales for name in self.names]  # type: ignore[index]
 
+    @property
+    def finest(self) -> dict[str, Tensor]:
+        """The planes of the finest scale. [C, rows, columns] each"""
+        return {name: plane[0] for name, plane in self.planes()[-len(self.names) :]}
+
     def forward(self, points: Tensor, times: Tensor) -> Tensor:
-        """Features of points at times.
+        """Features of all scales, concatenated, at points in [-1, 1]^3 and times from 0 to 1.
 
-        Args:
-            points: Positions; the planes cover [-1, 1]^3. [N, 3]
-            times: Times from 0 to 1. [N]
-
-        Returns:
-            Features of all scales, concatenated. [N, channels * scales]
+        [N, 3], [N] -> [N, channels * scales]
         """
         places = torch.cat([points, 2 * times[:, None] - 1], dim=1)
         found = [
@@ -196,11 +196,8 @@ class _Kernels(torch.autograd.Function):
         ctx: Any, *gradients: Tensor
     ) -> tuple[Tensor | None, ...]:
         places, *planes = ctx.saved_tensors
-        channels_last = torch.channels_last
-        found = [
-            torch.zeros_like(plane, dtype=places.dtype, memory_format=channels_last)
-            for plane in planes
-        ]
+        form = {"dtype": places.dtype, "memory_format": torch.channels_last}
+        found = [torch.zeros_like(plane, **form) for plane in planes]
         if len(places):
             importlib.import_module("xplanes.baselines.products_triton").multiply_backward(
                 tuple(_rows(plane) for plane in planes),
@@ -269,20 +266,32 @@ class PlaneTerms:
     time_smoothness: float
     time_identity: float
 
+    @classmethod
+    def of(cls, settings: Any) -> "PlaneTerms":
+        """The weights among the settings of a loss."""
+        return cls(*(getattr(settings, each.name) for each in fields(cls)))
+
+    @torch.no_grad()
+    def weighted(self, products: PlaneProducts) -> dict[str, float]:
+        """The weighted terms by name, for the logger."""
+        values = self.values(products)
+        return {name: getattr(self, name) * float(value) for name, value in values.items()}
+
     def values(self, products: PlaneProducts) -> dict[str, Tensor]:
         """The three terms by name, without their weights. [] each"""
         planes = products.planes()
-        zero = planes[0][1].new_zeros(())
-        names = ("total_variation", "time_smoothness", "time_identity")
-        found: dict[str, Tensor] = dict.fromkeys(names, zero)
+        variation = smoothness = identity = planes[0][1].new_zeros(())
         for name, plane in planes:
             dims, factor = self._variation(name, len(planes))
-            term = factor * total_variation(plane, dims)
-            found["total_variation"] = found["total_variation"] + term
+            variation = variation + factor * total_variation(plane, dims)
             if "t" in name:
-                found["time_smoothness"] = found["time_smoothness"] + time_smoothness(plane[0])
-                found["time_identity"] = found["time_identity"] + (1 - plane).abs().mean()
-        return found
+                smoothness = smoothness + time_smoothness(plane[0])
+                identity = identity + (1 - plane).abs().mean()
+        return {
+            "total_variation": variation,
+            "time_smoothness": smoothness,
+            "time_identity": identity,
+        }
 
     @torch.no_grad()
     def add_gradients(self, products: PlaneProducts) -> None:

@@ -112,33 +112,35 @@ class ProposalRenderer(RayRenderer):
         *,
         learn: bool = False,
     ) -> ProposalRendering:
-        """Render rays.
+        """Render rays, see `RayRenderer.render`.
 
-        Args:
-            field: Field from points, times and, if ``view_dependent``, directions to colour and
-                density.
-            origins: Ray origins in the field's frame. [R, 3]
-            directions: Unit directions. [R, 3]
-            times: Time of each ray, from 0 to 1. [R]
-            background: Background colour. [3] or [R, 3]
-            jitter: Generator of random numbers for stratified sampling; None for no jitter.
-            learn: Whether gradients reach the density fields.
-
-        Returns:
-            The rendering; gradients reach the field.
+        Samples are stratified by ``jitter``; if ``learn``, gradients reach the density fields, too.
         """
-        near, far = self._range(origins, directions)
-        place = _Rays(origins, directions, near, far, self.contracted)
-        levels = []
+        if self.near is None or self.far is None:
+            bounds = ray_box(origins, directions)
+        else:
+            bounds = (torch.full_like(origins[:, 0], bound) for bound in (self.near, self.far))
+        near, far = (bound[:, None] for bound in bounds)
+        levels: list[Level] = []
+
+        def placed(count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+            """Edges of the next level, its distances and lengths [R, S], and points [R S, 3]."""
+            edges = self._edges(levels, near, count, jitter)
+            if self.contracted:
+                ends = unspaced(torch.lerp(spaced(near), spaced(far), edges))
+            else:
+                ends = near + edges * (far - near)
+            distances = (ends[:, 1:] + ends[:, :-1]) / 2
+            points = origins[:, None] + distances[..., None] * directions[:, None]
+            return edges, distances, ends[:, 1:] - ends[:, :-1], points.flatten(0, 1)
+
         with torch.set_grad_enabled(learn and torch.is_grad_enabled()):
             for proposal, count in zip(self.proposals, self.counts, strict=True):
-                edges = self._edges(levels, count, place, jitter)
-                distances, lengths, points = place.samples(edges)
+                edges, distances, lengths, points = placed(count)
                 density = proposal(points, times.repeat_interleave(count))
                 weights = ray_weights(density.view_as(distances) * lengths)
                 levels.append(Level(edges, weights))
-        edges = self._edges(levels, self.samples, place, jitter)
-        distances, lengths, points = place.samples(edges)
+        edges, distances, lengths, points = placed(self.samples)
         samples = dense_samples(points, distances)
         colour, density = shade(field, points, times, directions, samples.ray)
         total, weights = composite(
@@ -156,47 +158,17 @@ class ProposalRenderer(RayRenderer):
             levels=tuple(levels),
         )
 
-    def _range(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        if self.near is None or self.far is None:
-            return ray_box(origins, directions)
-        ones = torch.ones_like(origins[:, 0])
-        return self.near * ones, self.far * ones
-
     def _edges(
-        self,
-        levels: Sequence[Level],
-        count: int,
-        rays: "_Rays",
-        jitter: torch.Generator | None,
+        self, levels: Sequence[Level], near: Tensor, count: int, jitter: torch.Generator | None
     ) -> Tensor:
-        uniform, device = None, rays.near.device
+        uniform, device = None, near.device
         if jitter is not None:
-            uniform = torch.rand(len(rays.near), count + 1, generator=jitter, device=device)
+            uniform = torch.rand(len(near), count + 1, generator=jitter, device=device)
         if not levels:
-            return uniform_edges(len(rays.near), count, uniform, device)
+            return uniform_edges(len(near), count, uniform, device)
         last = levels[-1]
         weights = last.weights.detach() ** self.exponent
         return resample(last.edges, weights, count, uniform, self.padding)
-
-
-@dataclass(frozen=True)
-class _Rays:
-    origins: Tensor
-    directions: Tensor
-    near: Tensor
-    far: Tensor
-    contracted: bool = False
-
-    def samples(self, edges: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Distances and lengths [R, S] and points [R S, 3] of the bins between ``edges``."""
-        near, far = self.near[:, None], self.far[:, None]
-        if self.contracted:
-            ends = unspaced(torch.lerp(spaced(near), spaced(far), edges))
-        else:
-            ends = near + edges * (far - near)
-        distances = (ends[:, 1:] + ends[:, :-1]) / 2
-        points = self.origins[:, None] + distances[..., None] * self.directions[:, None]
-        return distances, ends[:, 1:] - ends[:, :-1], points.flatten(0, 1)
 
 
 def spaced(distances: Tensor) -> Tensor:
@@ -293,20 +265,14 @@ class ProposalSettings(SamplerSettings):
             check_range(site, self.near, self.far)
             scale = site.frame.scale
             bounds = {"near": self.near * scale, "far": self.far * scale}
+        rows = self.time_resolution if site.moves else None
+        initial = {"low": self.space_low, "high": self.space_high}
         proposals = nn.ModuleList()
         with initial_values(site.seed, Stream.SAMPLER):
             for resolution in self.resolutions:
-                products = PlaneProducts(
-                    self.channels,
-                    resolution,
-                    [1],
-                    self.time_resolution if site.moves else None,
-                    low=self.space_low,
-                    high=self.space_high,
-                )
                 proposals.append(
                     DensityField(
-                        products,
+                        PlaneProducts(self.channels, resolution, [1], rows, **initial),
                         self.width,
                         linear=self.linear,
                         unit=site.unit,
@@ -339,12 +305,7 @@ class ProposalSampler(Sampler):
         self._renderer, self.settings = renderer, settings
         renderer.exponent.fill_(self.anneal(0))
         self.schedule = UpdateSchedule(settings.update_every, settings.update_warmup)
-        self.terms = PlaneTerms(
-            settings.total_variation,
-            settings.variation,
-            settings.time_smoothness,
-            settings.time_identity,
-        )
+        self.terms = PlaneTerms.of(settings)
 
     @property
     def renderer(self) -> ProposalRenderer:
@@ -392,14 +353,13 @@ class ProposalSampler(Sampler):
             assert isinstance(proposal, DensityField)
             self.terms.add_gradients(proposal.products)
 
-    @torch.no_grad()
     def regularisers(self, field: Any, state: TrainingState) -> dict[str, float]:
         totals: dict[str, float] = {}
         for proposal in self._renderer.proposals:
             assert isinstance(proposal, DensityField)
-            for name, value in self.terms.values(proposal.products).items():
+            for name, value in self.terms.weighted(proposal.products).items():
                 key = f"proposal_{name}"
-                totals[key] = totals.get(key, 0.0) + getattr(self.terms, name) * float(value)
+                totals[key] = totals.get(key, 0.0) + value
         return totals
 
 

@@ -49,12 +49,17 @@ class LRM(nn.Module):
         """Half the side of the field's cube, in the model's frame."""
         return self.view.half_side
 
+    @property
+    def background(self) -> float:
+        """Grey value of the background of input images, in [0, 1]."""
+        return self.view.background
+
     def encode(self, images: Tensor, camera: Tensor | None = None) -> Tensor:
         """Predict triplanes from images.
 
         Args:
-            images: RGB from 0 to 1, composited on ``view.background``. OpenLRM requires S to be a
-                multiple of its patch size. [N, 3, S, S]
+            images: RGB from 0 to 1, composited on `background`. OpenLRM requires S to be a multiple
+                of its patch size. [N, 3, S, S]
             camera: Camera vectors of OpenLRM; the canonical camera when None. TripoSR has no camera
                 input. [N, 16]
 

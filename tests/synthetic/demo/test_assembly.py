@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests.refusals import assert_refused
 from tests.synthetic.rays import float_rays, rays
 from xplanes.scenes.cameras import focal_length
-from xplanes.synthetic.demo import DEMO_SCENES, Assembly, Joint, Part, build_demo_scene
+from xplanes.synthetic.demo.assembly import Assembly, Joint, Part
 from xplanes.synthetic.demo.geometry import (
     Box,
     Capsule,
@@ -27,6 +27,7 @@ from xplanes.synthetic.demo.geometry import (
 )
 from xplanes.synthetic.demo.motions import Bounce, Keys, Steady, Swing
 from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, camera_at, render_image
+from xplanes.synthetic.demo.scenes import DEMO_SCENES, build_demo_scene
 from xplanes.synthetic.demo.shading import Light
 
 RED, BLUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
@@ -65,16 +66,14 @@ def test_cast_equals_the_nearest_of_all_parts():
 
 
 def test_hits_bound_the_inside():
-    assembly = small_assembly()
+    posed = small_assembly().pose(0.6)
     origins, directions = float_rays(3000, seed=1)
-    distance = assembly.cast(origins, directions, 0.6).distance
+    distance = posed.cast(origins, directions).distance
     found = distance.isfinite()
     beyond = origins + (distance + 1e-3)[:, None] * directions
     before = origins + (distance - 1e-3)[:, None] * directions
-    assert not assembly.inside(before[found], 0.6).any()
-    assert assembly.inside(beyond[found], 0.6).float().mean() > 0.97
-    gap, _ = assembly.pose(0.6).signed_distance(beyond[found])
-    assert torch.equal(gap < 0, assembly.inside(beyond[found], 0.6))
+    assert not posed.inside(before[found]).any()
+    assert posed.inside(beyond[found]).float().mean() > 0.97
 
 
 @settings(max_examples=25, deadline=None)
@@ -151,9 +150,9 @@ def test_light_is_lambert_with_shadows():
     origins = torch.tensor([[-0.95, 0.0, 0.1], [0.9, 0.0, 1.0]])
     directions = torch.tensor([[0.95, 0.0, -0.1], [0.0, 0.0, -1.0]])
     directions = directions / directions.norm(dim=-1, keepdim=True)
-    lit = Assembly((floor,), light=light).cast(origins, directions, 0)
+    lit = Assembly((floor,), light=light).pose(0).cast(origins, directions)
     assert torch.allclose(lit.colour, torch.full((2, 3), 0.7), atol=1e-5)
-    shaded = Assembly((floor, ball), light=light).cast(origins, directions, 0)
+    shaded = Assembly((floor, ball), light=light).pose(0).cast(origins, directions)
     assert shaded.part.tolist() == [0, 0]
     expected = torch.tensor([0.2, 0.7])[:, None].expand(2, 3)
     assert torch.allclose(shaded.colour, expected, atol=1e-5)

@@ -57,8 +57,6 @@ def test_layout_is_that_of_d_nerf(folder):
                 assert picture.mode == "RGBA"
                 assert picture.size == (16, 16)
             pose = torch.tensor(frame["transform_matrix"], dtype=torch.float64)
-            assert torch.allclose(pose[:3, :3] @ pose[:3, :3].T, torch.eye(3).double())
-            assert pose[:3, :3].det().item() == pytest.approx(1)
             assert pose[:3, 3].norm().item() == pytest.approx(CAMERA_DISTANCE)
             assert pose[2, 3] >= 0
             # It looks at the origin along -z.

@@ -7,10 +7,12 @@ import numpy as np
 import torch
 
 from tests.baselines.runs import under
+from xplanes.components import read_settings
+from xplanes.config import compose_plain
+from xplanes.lrm.canonical import OPENLRM_VIEW, CanonicalView
 from xplanes.lrm.config import parse_config
 from xplanes.synthetic.pretraining.pool import FOCAL, Pool, draw_sample
-from xplanes.synthetic.pretraining.run import compose_pretraining
-from xplanes.synthetic.pretraining.settings import parse_pretraining, published_sizes
+from xplanes.synthetic.pretraining.settings import PretrainingSettings, published_sizes
 
 OVERRIDES = (
     *under("model", image_size=24, patch=8, encoder_depth=1, width=48, heads=2, layers=2),
@@ -20,12 +22,13 @@ OVERRIDES = (
     *under("schedule", max_seconds="null", warmup_steps=2, render_from=0.5, score_objects=2),
 )
 SIDE = 24
+VIEW = CanonicalView(OPENLRM_VIEW.rotation, 2.9, FOCAL, 1.0, 1.0)
 
 
 @functools.cache
 def composed(*overrides):
     """What Hydra makes of these overrides; composing takes a fifth of a second."""
-    return compose_pretraining([*OVERRIDES, *overrides])
+    return compose_plain("pretrain_lrm", [*OVERRIDES, *overrides])
 
 
 def small_plain(*overrides):
@@ -33,7 +36,7 @@ def small_plain(*overrides):
 
 
 def small_config(*overrides):
-    return parse_pretraining(small_plain(*overrides))
+    return read_settings(PretrainingSettings, small_plain(*overrides))
 
 
 def small_sizes(*overrides):

@@ -7,15 +7,14 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.synthetic.pretraining.small import small_pool, small_sizes
+from tests.synthetic.pretraining.small import VIEW, small_pool, small_sizes
 from tests.synthetic.pretraining.test_solids import one
 from xplanes.cli import main
 from xplanes.fields.decoder import Decoder
-from xplanes.lrm.canonical import OPENLRM_VIEW, CanonicalView
 from xplanes.synthetic.demo.render import camera_at
 from xplanes.synthetic.pretraining import score as score_module
 from xplanes.synthetic.pretraining.initialisation import init_model
-from xplanes.synthetic.pretraining.pool import FOCAL, inside, render_solids
+from xplanes.synthetic.pretraining.pool import inside, render_solids
 from xplanes.synthetic.pretraining.quick import QuickLook, overlap, world_to_model
 from xplanes.synthetic.pretraining.score import Subject, demo_subjects, held_out, score, score_all
 from xplanes.synthetic.pretraining.solids import BOX
@@ -40,8 +39,7 @@ class Oracle(Decoder):
 class KnowingModel:
     """Answers every picture with the same object."""
 
-    view = CanonicalView(OPENLRM_VIEW.rotation, 2.9, FOCAL, 1.0, 1.0)
-    half_side, image_size = 1.0, SIDE
+    view, half_side, image_size = VIEW, 1.0, SIDE
 
     def __init__(self, solids, pose, colour):
         self.decoder = Oracle(solids, world_to_model(pose, self), colour)  # type: ignore[arg-type]

@@ -5,7 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from xplanes.config import CONF
+from xplanes.components import read_settings
+from xplanes.config import CONF, compose_plain
 from xplanes.lrm.alignment import align
 from xplanes.lrm.config import parse_config
 from xplanes.lrm.weights import FOLDER, bundled_models, load_bundled
@@ -13,9 +14,8 @@ from xplanes.scenes.cameras import focal_length
 from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE, camera_at
 from xplanes.synthetic.pretraining import score as score_module
 from xplanes.synthetic.pretraining.pool import FOCAL
-from xplanes.synthetic.pretraining.run import compose_pretraining
 from xplanes.synthetic.pretraining.score import held_out
-from xplanes.synthetic.pretraining.settings import parse_pretraining, published_sizes
+from xplanes.synthetic.pretraining.settings import PretrainingSettings, published_sizes
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,8 @@ def test_there_are_two_and_together_they_are_small():
 
 def test_the_weights_are_of_the_described_model(models):
     for name, model in models.items():
-        sizes = parse_pretraining(compose_pretraining([f"pretrain={name}"])).model
+        plain = compose_plain("pretrain_lrm", [f"pretrain={name}"])
+        sizes = read_settings(PretrainingSettings, plain).model
         assert sizes.name == name
         wanted = parse_config(published_sizes(sizes, FOCAL))
         assert dataclasses.asdict(model.config) == dataclasses.asdict(wanted), name

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from xplanes.baselines.gaussians.field import DeformedGaussians
-from xplanes.baselines.gaussians.model import GaussiansModel, GaussiansSettings, camera_extent
+from xplanes.baselines.gaussians.model import GaussiansModel, GaussiansSettings
 from xplanes.errors import ConfigError
 from xplanes.models.base import InitialValues
 from xplanes.rendering.sampler import Group, Site
@@ -41,9 +41,7 @@ class DeformedGaussiansSettings(GaussiansSettings):
     def build(self, site: Site, initial: InitialValues | None = None) -> "DeformedGaussiansModel":
         with initial_values(site.seed, Stream.FIELD):
             field = DeformedGaussians(
-                self.first_points(site, initial),
-                degree=self.degree,
-                extent=camera_extent(site),
+                **self.canonical(site, initial),
                 moves=site.moves,
                 depth=self.depth,
                 width=self.width,
@@ -54,24 +52,10 @@ class DeformedGaussiansSettings(GaussiansSettings):
         return DeformedGaussiansModel(self, field)
 
 
-class DeformedGaussiansModel(GaussiansModel):
-    """Colour errors and adaptive density control.
+class DeformedGaussiansModel(GaussiansModel[DeformedGaussiansSettings, DeformedGaussians]):
+    """Colour errors and adaptive density control."""
 
-    Args:
-        settings: Learning rates, schedule and weights.
-        field: The Gaussians.
-    """
-
-    def __init__(self, settings: DeformedGaussiansSettings, field: DeformedGaussians) -> None:
-        super().__init__(settings, field)
-        self._field, self.settings, self.static_share = field, settings, settings.static_share
-        self.advice = (
-            f"Lower model.scale_lr={settings.scale_lr} or model.network_lr={settings.network_lr}"
-        )
-
-    @property
-    def field(self) -> DeformedGaussians:
-        return self._field
+    doubted = ("scale_lr", "network_lr")
 
     def groups(self) -> list[Group]:
         groups, network = super().groups(), list(self._field.network.parameters())

@@ -4,7 +4,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -96,9 +96,7 @@ class Gaussians(Representation):
     Source: Kerbl et al. 2023, released code.
     """
 
-    PARAMETERS: ClassVar[tuple[str, ...]] = (
-        *("means", "quaternions", "log_scales", "logits", "base", "detail"),
-    )
+    PARAMETERS: tuple[str, ...] = ("means", "quaternions", "log_scales", "logits", "base", "detail")
     STATISTICS = ("slopes", "seen")
 
     def __init__(self, cloud: PointCloud, *, degree: int, extent: float, moves: bool) -> None:
@@ -118,6 +116,7 @@ class Gaussians(Representation):
         self.register_buffer("degree", torch.tensor(0))
         self.register_buffer("deforms", torch.tensor(False))
         self.register_buffer("extent", torch.tensor(extent))
+        self.register_load_state_dict_pre_hook(_fit_rows)
 
     slopes: Tensor
     seen: Tensor
@@ -128,10 +127,6 @@ class Gaussians(Representation):
     @property
     def moves(self) -> bool:
         return self._moves
-
-    @property
-    def precision(self) -> str:
-        return "32"
 
     @property
     def outline(self) -> str:
@@ -181,38 +176,22 @@ class Gaussians(Representation):
 
     def at(self, time: float) -> PosedGaussians:
         """The Gaussians at a time from 0 to 1; gradients reach the parameters."""
-        canonical = PosedGaussians(
-            self.means,
-            self.quaternions,
-            self.scales,
-            self.opacities,
-            torch.cat([self.base, self.detail], dim=1),
-            int(self.degree),
-        )
+        harmonics = torch.cat([self.base, self.detail], dim=1)
+        shape = self.means, self.quaternions, self.scales
+        canonical = PosedGaussians(*shape, self.opacities, harmonics, int(self.degree))
         return self.moved(canonical, time) if self.moves and self.deforms else canonical
 
     def training_time(self, time: float, state: TrainingState) -> float:
         """The time at which a view is rendered in training; subclasses may add noise."""
         return time
 
-    def _load_from_state_dict(
-        self,
-        state_dict: Any,
-        prefix: str,
-        local_metadata: Any,
-        strict: bool,
-        missing_keys: list[str],
-        unexpected_keys: list[str],
-        error_msgs: list[str],
-    ) -> None:
-        count = len(state_dict.get(f"{prefix}means", self.means))
-        if count != len(self):
-            for tensor in self.rows.values():
-                tensor.data = tensor.new_zeros(count, *tensor.shape[1:])
-        super()._load_from_state_dict(
-            *(state_dict, prefix, local_metadata, strict),
-            *(missing_keys, unexpected_keys, error_msgs),
-        )
+
+def _fit_rows(field: Gaussians, state: Mapping[str, Any], prefix: str, *_rest: Any) -> None:
+    """Resize the rows to the number of Gaussians of the state."""
+    count = len(state.get(f"{prefix}means", field.means))
+    if count != len(field):
+        for tensor in field.rows.values():
+            tensor.data = tensor.new_zeros(count, *tensor.shape[1:])
 
 
 class MaskedGaussians(Masked):
@@ -231,24 +210,17 @@ class HexPlaneGaussians(Gaussians):
 
     Args:
         cloud: See `Gaussians`.
-        degree: See `Gaussians`.
-        extent: See `Gaussians`.
         planes: The planes; None for a static scene.
         width: Neurons of the hidden layers.
+        canonical: Other arguments of `Gaussians`.
 
     Source: 4D-GS (Wu et al. 2024), Section 4.
     """
 
     def __init__(
-        self,
-        cloud: PointCloud,
-        *,
-        degree: int,
-        extent: float,
-        planes: PlaneProducts | None,
-        width: int,
+        self, cloud: PointCloud, *, planes: PlaneProducts | None, width: int, **canonical: Any
     ) -> None:
-        super().__init__(cloud, degree=degree, extent=extent, moves=planes is not None)
+        super().__init__(cloud, **canonical, moves=planes is not None)
         self.products = planes
         self.network = nn.ModuleDict()
         if planes is not None:
@@ -260,11 +232,7 @@ class HexPlaneGaussians(Gaussians):
 
     @property
     def planes(self) -> Mapping[str, Tensor]:
-        """The planes of the finest scale. [C, rows, columns] each"""
-        if self.products is None:
-            return {}
-        names = self.products.names
-        return {name: plane[0] for name, plane in self.products.planes()[-len(names) :]}
+        return {} if self.products is None else self.products.finest
 
     def moved(self, canonical: PosedGaussians, time: float) -> PosedGaussians:
         assert self.products is not None
@@ -286,14 +254,12 @@ class DeformedGaussians(Gaussians):
 
     Args:
         cloud: See `Gaussians`.
-        degree: See `Gaussians`.
-        extent: See `Gaussians`.
-        moves: See `Gaussians`.
         depth: Number of hidden layers; the encoded input is concatenated after the middle one.
         width: Neurons of the hidden layers.
         octaves: Frequencies of the encodings of positions and times.
         noise: Initial standard deviation of the noise on time.
         noise_until: Share of training over which the noise fades to 0.
+        canonical: Other arguments of `Gaussians`.
 
     Source: Deformable 3D Gaussians (Yang et al. 2024), Section 3, and its released code.
     """
@@ -302,19 +268,17 @@ class DeformedGaussians(Gaussians):
         self,
         cloud: PointCloud,
         *,
-        degree: int,
-        extent: float,
-        moves: bool,
         depth: int,
         width: int,
         octaves: tuple[int, int],
         noise: float = 0.0,
         noise_until: float = 0.0,
+        **canonical: Any,
     ) -> None:
-        super().__init__(cloud, degree=degree, extent=extent, moves=moves)
+        super().__init__(cloud, **canonical)
         self.octaves, self.noise, self.noise_until = octaves, noise, noise_until
         self.network = nn.ModuleDict()
-        if moves:
+        if self.moves:
             of_place, of_time = 3 * (1 + 2 * octaves[0]), 1 + 2 * octaves[1]
             inputs, self._entry = of_place + TIME_FEATURES, depth // 2 + 1
             self.network["time"] = layers([of_time, width, TIME_FEATURES])
@@ -324,10 +288,6 @@ class DeformedGaussians(Gaussians):
             self.network["hidden"] = nn.ModuleList(nn.Linear(count, width) for count in columns)
             for name, outputs in HEADS.items():
                 self.network[name] = _still(width, outputs)
-
-    @property
-    def planes(self) -> Mapping[str, Tensor]:
-        return {}
 
     def moved(self, canonical: PosedGaussians, time: float) -> PosedGaussians:
         places = octaves(self.means.detach(), self.octaves[0])
@@ -364,10 +324,8 @@ class SpacetimeGaussians(Gaussians):
 
     Args:
         cloud: See `Gaussians`; its times are the initial centres, which are random without times.
-        degree: See `Gaussians`.
-        extent: See `Gaussians`.
-        moves: See `Gaussians`.
         width: Initial width of the radial basis; the whole sequence has length 1.
+        canonical: Other arguments of `Gaussians`.
 
     Source: Spacetime Gaussians (Li et al. 2024), Section 4.1, in its lite version: without the
     network after the rasteriser.
@@ -375,21 +333,15 @@ class SpacetimeGaussians(Gaussians):
 
     PARAMETERS = (*Gaussians.PARAMETERS, "centres", "log_widths", "motion", "spin")
 
-    def __init__(
-        self, cloud: PointCloud, *, degree: int, extent: float, moves: bool, width: float
-    ) -> None:
-        super().__init__(cloud, degree=degree, extent=extent, moves=moves)
+    def __init__(self, cloud: PointCloud, *, width: float, **canonical: Any) -> None:
+        super().__init__(cloud, **canonical)
         count = len(cloud.points)
         centres = torch.rand(count) if cloud.times is None else cloud.times.clone()
         self.centres = nn.Parameter(centres)
         self.log_widths = nn.Parameter(torch.full((count,), math.log(width)))
         self.motion = nn.Parameter(torch.zeros(count, ORDER, 3))
         self.spin = nn.Parameter(torch.zeros(count, 4))
-        self.deforms.fill_(moves)
-
-    @property
-    def planes(self) -> Mapping[str, Tensor]:
-        return {}
+        self.deforms.fill_(self.moves)
 
     def moved(self, canonical: PosedGaussians, time: float) -> PosedGaussians:
         since = time - self.centres

@@ -7,12 +7,7 @@ import torch
 from torch import Tensor
 
 from xplanes.baselines.gaussians.field import HexPlaneGaussians
-from xplanes.baselines.gaussians.model import (
-    GaussiansLoss,
-    GaussiansModel,
-    GaussiansSettings,
-    camera_extent,
-)
+from xplanes.baselines.gaussians.model import GaussiansLoss, GaussiansModel, GaussiansSettings
 from xplanes.baselines.products import PlaneProducts
 from xplanes.errors import ConfigError
 from xplanes.fields.regularisers import add_time_smoothness_gradient, time_smoothness
@@ -63,33 +58,15 @@ class HexPlaneGaussiansSettings(GaussiansSettings):
                     self.channels, self.resolution, self.scales, rows, low=0.1, high=0.5
                 )
             field = HexPlaneGaussians(
-                self.first_points(site, initial),
-                degree=self.degree,
-                extent=camera_extent(site),
-                planes=planes,
-                width=self.width,
+                **self.canonical(site, initial), planes=planes, width=self.width
             )
         return HexPlaneGaussiansModel(self, field)
 
 
-class HexPlaneGaussiansModel(GaussiansModel):
-    """Colour errors, smoothness of planes, and adaptive density control.
+class HexPlaneGaussiansModel(GaussiansModel[HexPlaneGaussiansSettings, HexPlaneGaussians]):
+    """Colour errors, smoothness of planes, and adaptive density control."""
 
-    Args:
-        settings: Learning rates, schedule and weights.
-        field: The Gaussians.
-    """
-
-    def __init__(self, settings: HexPlaneGaussiansSettings, field: HexPlaneGaussians) -> None:
-        super().__init__(settings, field)
-        self._field, self.settings, self.static_share = field, settings, settings.static_share
-        self.advice = (
-            f"Lower model.scale_lr={settings.scale_lr} or model.plane_lr={settings.plane_lr}"
-        )
-
-    @property
-    def field(self) -> HexPlaneGaussians:
-        return self._field
+    doubted = ("scale_lr", "plane_lr")
 
     def groups(self) -> list[Group]:
         settings, field, groups = self.settings, self._field, super().groups()

@@ -2,18 +2,19 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
+from xplanes.baselines.base import BaselineModel
 from xplanes.baselines.gaussians.densification import DensifySettings, densify, reset_opacity
 from xplanes.baselines.gaussians.field import Gaussians, PointCloud
 from xplanes.baselines.gaussians.harmonics import MAX_DEGREE
 from xplanes.baselines.gaussians.hull import hull_points, random_points
 from xplanes.errors import ConfigError
 from xplanes.metrics import dissimilarity
-from xplanes.models.base import InitialValues, Model, ModelSettings
+from xplanes.models.base import InitialValues, ModelSettings
 from xplanes.rendering.sampler import Group, Site
 from xplanes.scenes.batches import Batch, ViewSettings
 from xplanes.settings import Count, Positive, Settings, Share, Steps
@@ -73,55 +74,56 @@ class GaussiansSettings(ModelSettings):
                 f"count={self.count}: must not be above densify.most={self.densify.most}"
             )
 
-    def first_points(self, site: Site, initial: InitialValues | None) -> PointCloud:
-        """Points from which the Gaussians are initialised, drawn with torch's global generator."""
+    def canonical(self, site: Site, initial: InitialValues | None) -> dict[str, Any]:
+        """Arguments of all fields: initial points, degree, and extent of the cameras.
+
+        Points are drawn with torch's global generator.
+        """
         if isinstance(initial, InitialPoints):
-            return initial.cloud
-        if site.views is None:
-            return random_points(1)  # The Gaussians are loaded from a checkpoint.
-        if self.points == "silhouettes":
-            return hull_points(site.views, site.frame, self.count)
-        return random_points(self.count)
+            cloud = initial.cloud
+        elif site.views is None:
+            cloud = random_points(1)  # The Gaussians are loaded from a checkpoint.
+        elif self.points == "silhouettes":
+            cloud = hull_points(site.views, site.frame, self.count)
+        else:
+            cloud = random_points(self.count)
+        return {"cloud": cloud, "degree": self.degree, "extent": camera_extent(site)}
 
 
-class GaussiansModel(Model):
-    """Absolute colour error and dissimilarity (1 - SSIM), and adaptive density control.
+S = TypeVar("S", bound=GaussiansSettings)
+F = TypeVar("F", bound=Gaussians)
 
-    Args:
-        settings: Learning rates, schedule and weights.
-        field: The Gaussians.
-    """
 
-    static_share = 0.0
-    """Share of the budget before anything moves."""
+class GaussiansModel(BaselineModel[S, F]):
+    """Absolute colour error and dissimilarity (1 - SSIM), and adaptive density control."""
 
-    def __init__(self, settings: GaussiansSettings, field: Gaussians) -> None:
-        self._field, self._settings = field, settings
-        self.advice = (
-            f"Lower model.scale_lr={settings.scale_lr} or model.mean_lr={settings.mean_lr}"
-        )
+    doubted = ("scale_lr", "mean_lr")
 
     @property
-    def field(self) -> Gaussians:
-        return self._field
+    def static_share(self) -> float:
+        """Share of the budget before anything moves."""
+        return getattr(self.settings, "static_share", 0.0)
 
     @property
     def replaces_parameters(self) -> bool:
-        return self._settings.densify.until > 0
+        return self.settings.densify.until > 0
 
-    def groups(self) -> list[Group]:
-        settings, field = self._settings, self._field
-        rates = {
-            "means": settings.mean_lr * float(field.extent),
+    def rates(self) -> dict[str, float]:
+        """Learning rates of the tensors with one row per Gaussian."""
+        settings = self.settings
+        return {
+            "means": settings.mean_lr * float(self._field.extent),
             "quaternions": settings.rotation_lr,
             "log_scales": settings.scale_lr,
             "logits": settings.opacity_lr,
             "base": settings.colour_lr,
             "detail": settings.colour_lr / 20,
         }
+
+    def groups(self) -> list[Group]:
         return [
-            {"params": [getattr(field, name)], "lr": rate, "name": name}
-            for name, rate in rates.items()
+            {"params": [getattr(self._field, name)], "lr": rate, "name": name}
+            for name, rate in self.rates().items()
         ]
 
     def rate_factor(self, step: int, progress: float) -> float:
@@ -129,10 +131,10 @@ class GaussiansModel(Model):
 
     def group_rate_factor(self, group: str, step: int, progress: float) -> float:
         """Exponential decay of the means' learning rate."""
-        return self._settings.final_lr**progress if group == "means" else 1.0
+        return self.settings.final_lr**progress if group == "means" else 1.0
 
     def before_step(self, state: TrainingState, optimizer: torch.optim.Optimizer) -> None:
-        settings, field, step = self._settings, self._field, state.step
+        settings, field, step = self.settings, self._field, state.step
         field.degree.fill_(min(settings.degree, step // settings.degree_every))
         if field.moves and not field.deforms and state.progress >= self.static_share:
             field.deforms.fill_(True)
@@ -154,7 +156,7 @@ class GaussiansModel(Model):
         return
 
     def losses(self, rendering: Any, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
-        share, target = self._settings.loss.dissimilarity, rays["target"]
+        share, target = self.settings.loss.dissimilarity, rays["target"]
         colour = rendering.colour
         if (shown := rays.get("shown")) is not None:  # Ignored pixels have no error.
             colour = torch.where(shown[:, None], colour, target)

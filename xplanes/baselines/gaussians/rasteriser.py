@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from xplanes.backend import compiled, cpu_loops
 from xplanes.baselines.gaussians import rasteriser_cuda
 from xplanes.baselines.gaussians.camera import Camera
-from xplanes.baselines.gaussians.reference import blend, project
+from xplanes.baselines.gaussians.reference import Splats, blend, project
 from xplanes.errors import XPlanesError
 
 MOST = 2**24
@@ -85,27 +85,17 @@ def rasterise(
 
     Source: Kerbl et al. 2023 (3D Gaussian splatting).
     """
-    given = {
-        **{"means": means, "quaternions": quaternions, "scales": scales},
-        **{"opacities": opacities, "colours": colours},
-    }
-    _check(given, background)
-    means = means if means.dtype == torch.float64 else means.float()
+    given = Splats(means, quaternions, scales, opacities, colours)
+    _check(given._asdict(), background)
+    dtype = torch.float64 if means.dtype == torch.float64 else torch.float32
+    splats = Splats(*(tensor.to(dtype) for tensor in given))
     draw = _draw_reference
-    if means.dtype == torch.float32:
-        if cpu_loops(means):
+    if dtype == torch.float32:
+        if cpu_loops(splats.means):
             draw = _draw
         elif means.is_cuda:
             draw = rasteriser_cuda.draw
-    means2d, radii, image, opacity = draw(
-        means,
-        quaternions.to(means.dtype),
-        scales.to(means.dtype),
-        opacities.to(means.dtype),
-        colours.to(means.dtype),
-        camera,
-        antialiased,
-    )
+    means2d, radii, image, opacity = draw(splats, camera, antialiased)
     colour, depth = image[..., :-1], image[..., -1]
     if background is not None:
         colour = colour + (1 - opacity)[..., None] * background.to(colour)
@@ -114,49 +104,30 @@ def rasterise(
 
 
 def _draw_reference(
-    means: Tensor,
-    quaternions: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colours: Tensor,
-    camera: Camera,
-    antialiased: bool,
+    splats: Splats, camera: Camera, antialiased: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Projected means and radii, sums of colours and depths, and opacity, in plain torch."""
-    projection = project(means, quaternions, scales, opacities, camera, antialiased=antialiased)
-    features = torch.cat([colours, projection.depths[:, None]], dim=1)
+    projection = project(splats, camera, antialiased)
+    features = torch.cat([splats.colours, projection.depths[:, None]], dim=1)
     return projection.means, projection.radii, *blend(projection, features, camera)
 
 
 def _draw(
-    means: Tensor,
-    quaternions: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colours: Tensor,
-    camera: Camera,
-    antialiased: bool,
+    splats: Splats, camera: Camera, antialiased: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Version of `_draw_reference` with compiled loops."""
-    parts = _Project.apply(means, quaternions, scales, opacities, camera, antialiased)
+    parts = _Project.apply(camera, antialiased, *splats[:4])
     means2d, _, depths, _, radii = parts  # type: ignore[misc]
-    features = torch.cat([colours, depths[:, None]], dim=1)
-    return means2d, radii, *_Blend.apply(*parts, features, camera)  # type: ignore[misc]
+    features = torch.cat([splats.colours, depths[:, None]], dim=1)
+    return means2d, radii, *_Blend.apply(camera, *parts, features)  # type: ignore[misc]
 
 
 class _Project(torch.autograd.Function):
+    """Means, quaternions, scales and opacities to the parts of a `Projection`."""
+
     @staticmethod
-    def forward(
-        ctx: Any,
-        means: Tensor,
-        quaternions: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        camera: Camera,
-        antialiased: bool,
-    ) -> tuple[Tensor, ...]:
-        cpu = compiled("xplanes.baselines.gaussians.rasteriser_numba")
-        inputs = [t.contiguous() for t in (means, quaternions, scales, opacities)]
+    def forward(ctx: Any, camera: Camera, antialiased: bool, *given: Tensor) -> tuple[Tensor, ...]:
+        inputs = [t.contiguous() for t in given]
         ctx.camera = np.array(
             [
                 *camera.world_to_camera[:3].double().flatten().tolist(),
@@ -164,11 +135,11 @@ class _Project(torch.autograd.Function):
                 *camera.slant,
             ]
         )
-        ctx.antialiased, count = antialiased, len(means)
+        ctx.antialiased, count = antialiased, len(inputs[0])
         shapes = ((count, 2), (count, 3), (count,), (count,))
-        outputs = [means.new_empty(shape) for shape in shapes]
-        outputs.append(means.new_empty(count, dtype=torch.int64))
-        cpu.project(
+        outputs = [inputs[0].new_empty(shape) for shape in shapes]
+        outputs.append(torch.empty(count, dtype=torch.int64))
+        compiled("xplanes.baselines.gaussians.rasteriser_numba").project(
             *(t.detach().numpy() for t in inputs),
             ctx.camera,
             *(camera.near, camera.far, antialiased, camera.width, camera.height),
@@ -183,30 +154,23 @@ class _Project(torch.autograd.Function):
     def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any, *gradients: Tensor
     ) -> tuple[Tensor | None, ...]:
-        cpu = compiled("xplanes.baselines.gaussians.rasteriser_numba")
         *inputs, radii = ctx.saved_tensors
         found = [torch.empty_like(t) for t in inputs]
-        cpu.project_backward(
+        compiled("xplanes.baselines.gaussians.rasteriser_numba").project_backward(
             *(t.detach().numpy() for t in inputs),
             *(ctx.camera, ctx.antialiased, radii.numpy()),
             *(t.contiguous().numpy() for t in gradients[:-1]),
             *(t.numpy() for t in found),
         )
-        return *found, None, None
+        return None, None, *found
 
 
 class _Blend(torch.autograd.Function):
+    """The parts of a `Projection` and features to their weighted sums, and opacity."""
+
     @staticmethod
-    def forward(
-        ctx: Any,
-        means: Tensor,
-        whitening: Tensor,
-        depths: Tensor,
-        opacities: Tensor,
-        radii: Tensor,
-        features: Tensor,
-        camera: Camera,
-    ) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, camera: Camera, *given: Tensor) -> tuple[Tensor, Tensor]:
+        means, whitening, depths, opacities, radii, features = given
         cpu = compiled("xplanes.baselines.gaussians.rasteriser_numba")
         order = cpu.depth_order(depths.numpy(), radii.numpy())
         channels = -(-features.shape[1] // cpu.GROUP) * cpu.GROUP
@@ -253,7 +217,7 @@ class _Blend(torch.autograd.Function):
         d_means, d_whitening, d_opacities, d_features = (d_image.new_zeros(s) for s in ctx.shapes)
         found = [t.numpy() for t in (d_means, d_whitening, d_opacities, d_features)]
         cpu.scatter(ctx.order, geometry, ctx.slots, partial, *found)
-        return d_means, d_whitening, None, d_opacities, None, d_features, None
+        return None, d_means, d_whitening, None, d_opacities, None, d_features
 
 
 def _check(given: dict[str, Tensor], background: Tensor | None) -> None:

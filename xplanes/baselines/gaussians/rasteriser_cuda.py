@@ -4,18 +4,12 @@ import torch
 from torch import Tensor
 
 from xplanes.baselines.gaussians.camera import Camera
-from xplanes.baselines.gaussians.reference import LOW_PASS
+from xplanes.baselines.gaussians.reference import LOW_PASS, Splats
 from xplanes.optional import require
 
 
 def draw(
-    means: Tensor,
-    quaternions: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colours: Tensor,
-    camera: Camera,
-    antialiased: bool,
+    splats: Splats, camera: Camera, antialiased: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rasterise Gaussians in float32 on CUDA; for the arguments see `rasterise`.
 
@@ -28,12 +22,12 @@ def draw(
         MissingExtraError: If gsplat is not installed.
     """
     gsplat = require("gsplat", extra="gaussians")
-    intrinsics = means.new_tensor(
+    intrinsics = splats.means.new_tensor(
         [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
     )
     image, opacity, details = gsplat.rasterization(
-        *(means, quaternions, scales, opacities, colours),
-        viewmats=camera.world_to_camera.to(means)[None],
+        *splats,
+        viewmats=camera.world_to_camera.to(splats.means)[None],
         Ks=intrinsics[None],
         width=camera.width,
         height=camera.height,

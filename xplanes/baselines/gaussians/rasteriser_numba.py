@@ -6,8 +6,6 @@ and do not depend on the number of threads. This module is imported only when ne
 takes a second to load.
 """
 
-# ruff: noqa: D103 (rasteriser.py documents these loops)
-
 import numpy as np
 from numba import prange
 
@@ -187,6 +185,7 @@ def project_backward(
     d_scales,
     d_opacities,
 ):
+    """Gradients of `project`, from those of its outputs."""
     fx, fy = camera[12], camera[13]
     for n in prange(len(means)):
         for axis in range(3):
@@ -628,15 +627,7 @@ def blend_backward(
                 if member < last:
                     begin, end = _rows(geometry, m, top)
                     _blend_one_backward(
-                        flat,
-                        begin,
-                        end,
-                        member,
-                        geometry,
-                        features,
-                        m,
-                        group,
-                        sums,
+                        flat, begin, end, member, geometry, features, m, group, sums
                     )
                 for entry in range(MOMENTS):
                     partial[slot, entry] = sums[entry]

@@ -4,6 +4,7 @@ Zwicker et al. 2002 (EWA splatting), Kerbl et al. 2023 (3D Gaussian splatting).
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -30,6 +31,16 @@ TILE = 16
 """Side of the square tiles, in pixels. The image does not depend on it."""
 
 
+class Splats(NamedTuple):
+    """Gaussians in the world; see `rasterise` in rasteriser.py."""
+
+    means: Tensor
+    quaternions: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colours: Tensor
+
+
 @dataclass(frozen=True)
 class Projection:
     """Gaussians projected to the image plane.
@@ -51,33 +62,18 @@ class Projection:
     radii: Tensor
 
 
-def project(
-    means: Tensor,
-    quaternions: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    camera: Camera,
-    *,
-    antialiased: bool,
-) -> Projection:
+def project(splats: Splats, camera: Camera, antialiased: bool) -> Projection:
     """Project Gaussians by the linearised perspective of EWA; arguments as in `rasterise`."""
-    parts = (means, quaternions, scales, opacities)
     with torch.no_grad():
-        radii = _project(*parts, camera, antialiased, means.new_ones(len(means)).bool()).radii
+        everything = torch.ones_like(splats.opacities, dtype=torch.bool)
+        radii = _project(splats, camera, antialiased, everything).radii
     # Gaussians that are not drawn are replaced, so that their overflows do not reach gradients.
-    return replace(_project(*parts, camera, antialiased, radii > 0), radii=radii)
+    return replace(_project(splats, camera, antialiased, radii > 0), radii=radii)
 
 
-def _project(
-    means: Tensor,
-    quaternions: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    camera: Camera,
-    antialiased: bool,
-    wanted: Tensor,
-) -> Projection:
+def _project(splats: Splats, camera: Camera, antialiased: bool, wanted: Tensor) -> Projection:
     """Project; Gaussians that are not wanted are replaced by one in front of the camera."""
+    means, quaternions, scales, opacities, _ = splats
     world_to_camera = camera.world_to_camera.to(means)
     rotation, translation = world_to_camera[:3, :3], world_to_camera[:3, 3]
     x, y, z = (means @ rotation.T + translation).unbind(-1)

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from xplanes.baselines.gaussians.field import SpacetimeGaussians
-from xplanes.baselines.gaussians.model import GaussiansModel, GaussiansSettings, camera_extent
+from xplanes.baselines.gaussians.model import GaussiansModel, GaussiansSettings
 from xplanes.models.base import InitialValues
-from xplanes.rendering.sampler import Group, Site
+from xplanes.rendering.sampler import Site
 from xplanes.settings import Positive
 from xplanes.streams import Stream, initial_values
 
@@ -26,40 +26,19 @@ class SpacetimeGaussiansSettings(GaussiansSettings):
     def build(self, site: Site, initial: InitialValues | None = None) -> "SpacetimeGaussiansModel":
         with initial_values(site.seed, Stream.FIELD):
             field = SpacetimeGaussians(
-                self.first_points(site, initial),
-                degree=self.degree,
-                extent=camera_extent(site),
-                moves=site.moves,
-                width=self.first_width,
+                **self.canonical(site, initial), moves=site.moves, width=self.first_width
             )
         return SpacetimeGaussiansModel(self, field)
 
 
-class SpacetimeGaussiansModel(GaussiansModel):
-    """Colour errors and adaptive density control.
+class SpacetimeGaussiansModel(GaussiansModel[SpacetimeGaussiansSettings, SpacetimeGaussians]):
+    """Colour errors and adaptive density control."""
 
-    Args:
-        settings: Learning rates, schedule and weights.
-        field: The Gaussians.
-    """
-
-    def __init__(self, settings: SpacetimeGaussiansSettings, field: SpacetimeGaussians) -> None:
-        super().__init__(settings, field)
-        self._field, self.settings = field, settings
-
-    @property
-    def field(self) -> SpacetimeGaussians:
-        return self._field
-
-    def groups(self) -> list[Group]:
-        settings, field, groups = self.settings, self._field, super().groups()
-        rates = {
+    def rates(self) -> dict[str, float]:
+        settings = self.settings
+        return super().rates() | {
             "centres": settings.centre_lr,
             "log_widths": settings.width_lr,
-            "motion": settings.motion_lr * float(field.extent),
+            "motion": settings.motion_lr * float(self._field.extent),
             "spin": settings.spin_lr,
         }
-        return groups + [
-            {"params": [getattr(field, name)], "lr": rate, "name": name}
-            for name, rate in rates.items()
-        ]

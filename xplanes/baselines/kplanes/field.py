@@ -113,9 +113,7 @@ class KPlanes(ViewDependentField):
 
     @property
     def planes(self) -> Mapping[str, Tensor]:
-        """The planes of the finest scale. [C, rows, columns] each"""
-        names = self.products.names
-        return {name: plane[0] for name, plane in self.products.planes()[-len(names) :]}
+        return self.products.finest
 
     @property
     def moves(self) -> bool:
@@ -127,9 +125,8 @@ class KPlanes(ViewDependentField):
 
     @property
     def outline(self) -> str:
-        sizes = "/".join(
-            str(plane.shape[3]) for name, plane in self.products.planes() if name == "xy"
-        )
+        planes = self.products.planes()
+        sizes = "/".join(str(plane.shape[3]) for name, plane in planes if name == "xy")
         space = " over contracted space" if self.contracted else ""
         names = " ".join(self.products.names)
         return f"({names}, {sizes}{space}) · {self.products.channels} channels"

@@ -3,13 +3,12 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
-import torch
-
+from xplanes.baselines.base import BaselineModel
 from xplanes.baselines.bounds import fits_origin_cube, origin_cube, seen_range
 from xplanes.baselines.kplanes.field import ExplicitDecoder, HybridDecoder, KPlanes
 from xplanes.baselines.products import PlaneProducts, PlaneTerms, Variation
 from xplanes.errors import ConfigError
-from xplanes.models.base import InitialValues, Model, ModelSettings, warm_cosine
+from xplanes.models.base import InitialValues, ModelSettings, warm_cosine
 from xplanes.rendering.sampler import Group, Site
 from xplanes.scenes.frame import NO_HINTS, CubeHints, Frame, scene_frame
 from xplanes.scenes.views import Views
@@ -86,25 +85,14 @@ class KPlanesSettings(ModelSettings):
         return KPlanesModel(self, KPlanes(products, decode, site.unit, contracted=contracted))
 
 
-class KPlanesModel(Model):
-    """Colour error, smoothness of the planes, and distance of time planes from 1.
+class KPlanesModel(BaselineModel[KPlanesSettings, KPlanes]):
+    """Colour error, smoothness of the planes, and distance of time planes from 1."""
 
-    Args:
-        settings: Learning rate and weights.
-        field: The field.
-    """
+    doubted = ("learning_rate",)
 
     def __init__(self, settings: KPlanesSettings, field: KPlanes) -> None:
-        self._field, self.settings = field, settings
-        loss = settings.loss
-        self.terms = PlaneTerms(
-            loss.total_variation, loss.variation, loss.time_smoothness, loss.time_identity
-        )
-        self.advice = f"Lower model.learning_rate={settings.learning_rate}"
-
-    @property
-    def field(self) -> KPlanes:
-        return self._field
+        super().__init__(settings, field)
+        self.terms = PlaneTerms.of(settings.loss)
 
     def groups(self) -> list[Group]:
         rate = self.settings.learning_rate
@@ -119,7 +107,5 @@ class KPlanesModel(Model):
     def regularise(self, state: TrainingState) -> None:
         self.terms.add_gradients(self._field.products)
 
-    @torch.no_grad()
     def regularisers(self, state: TrainingState) -> dict[str, float]:
-        values = self.terms.values(self._field.products)
-        return {name: getattr(self.terms, name) * float(value) for name, value in values.items()}
+        return self.terms.weighted(self._field.products)

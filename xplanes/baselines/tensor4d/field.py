@@ -128,10 +128,6 @@ class Tensor4D(SurfaceField):
         return self.flow is not None
 
     @property
-    def precision(self) -> str:
-        return "32"
-
-    @property
     def outline(self) -> str:
         sizes = "/".join(str(level.resolution) for level in self.canonical_planes.levels)
         return f"(surface and flow, planes of {sizes})"
@@ -163,10 +159,6 @@ class Tensor4D(SurfaceField):
         self, points: Tensor, times: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Signed distance and its gradient through the flow; all results are differentiable.
-
-        Args:
-            points: Positions. [N, 3]
-            times: Times from 0 to 1. [N]
 
         Returns:
             Distance [N], gradient with respect to the points [N, 3], features for the colour
@@ -249,10 +241,6 @@ class Tensor4DDensity(ViewDependentField):
     @property
     def moves(self) -> bool:
         return any("t" in name for group in self.field_planes.groups for name in group)
-
-    @property
-    def precision(self) -> str:
-        return "32"
 
     @property
     def outline(self) -> str:

@@ -56,10 +56,9 @@ def bilinear(plane: Tensor, columns: Tensor, rows: Tensor) -> Tensor:
     texels = plane.reshape(-1, channels)
     first = upper * width + left
     right, below = min(width - 1, 1), min(height - 1, 1) * width
-    near = torch.lerp(texels.index_select(0, first), texels.index_select(0, first + right), u)
-    below_first = first + below
-    far = torch.lerp(
-        texels.index_select(0, below_first), texels.index_select(0, below_first + right), u
+    near, far = (
+        torch.lerp(texels.index_select(0, at), texels.index_select(0, at + right), u)
+        for at in (first, first + below)
     )
     return torch.lerp(near, far, v)
 
@@ -142,20 +141,17 @@ class HierarchicalPlanes(nn.Module):
 
     def _averaged(self, plane: Tensor) -> Tensor:
         size = [min(self.blur, side) for side in plane.shape[:2]]
-        return F.interpolate(plane.permute(2, 0, 1)[None], size=size, mode="area")[0].permute(
-            1, 2, 0
-        )
+        first = plane.permute(2, 0, 1)[None]
+        return F.interpolate(first, size=size, mode="area")[0].permute(1, 2, 0)
 
     def pictures(self) -> dict[str, Tensor]:
         """The finest planes by name. [C, rows, columns] each"""
-        last = len(self.levels) - 1
-        return {
-            name if len(group) == 1 else f"{name} of {group[0]}": self.planes[
-                self._key(last, group, name)
-            ].permute(2, 0, 1)
-            for group in self.groups
-            for name in group
-        }
+        last, found = len(self.levels) - 1, {}
+        for group in self.groups:
+            for name in group:
+                shown = name if len(group) == 1 else f"{name} of {group[0]}"
+                found[shown] = self.planes[self._key(last, group, name)].permute(2, 0, 1)
+        return found
 
 
 class Compression(nn.Module):
@@ -174,10 +170,8 @@ class Compression(nn.Module):
         super().__init__()
         self.parts = nn.ModuleList(
             nn.Sequential(
-                nn.Linear(inputs, width),
-                nn.LeakyReLU(),
-                nn.Linear(width, outputs),
-                nn.LeakyReLU(),
+                *(nn.Linear(inputs, width), nn.LeakyReLU()),
+                *(nn.Linear(width, outputs), nn.LeakyReLU()),
             )
             for _ in range(groups)
         )

@@ -1,12 +1,13 @@
 """Tensor4D (Shao et al., CVPR 2023) as in the released code, and a variant with a density."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from xplanes.baselines.base import BaselineModel
 from xplanes.baselines.proposal import ProposalRendering
 from xplanes.baselines.tensor4d.field import Tensor4D, Tensor4DDensity
 from xplanes.baselines.tensor4d.hierarchy import DYNAMIC, STATIC, Groups, HierarchicalPlanes, Level
@@ -109,26 +110,14 @@ class Tensor4DSettings(Tensor4DDensitySettings):
         return Tensor4DModel(self, field)
 
 
-class Tensor4DDensityModel(Model):
-    """Colour error, and the schedule of coarse and fine planes.
+S = TypeVar("S", bound=Tensor4DDensitySettings)
+Field = TypeVar("Field", Tensor4D, Tensor4DDensity)
 
-    Args:
-        settings: Learning rates and schedule.
-        field: The field.
-    """
 
-    def __init__(
-        self, settings: Tensor4DDensitySettings, field: Tensor4D | Tensor4DDensity
-    ) -> None:
-        self._field, self.settings = field, settings
-        self.advice = (
-            f"Lower model.learning_rate={settings.learning_rate} or "
-            f"model.plane_learning_rate={settings.plane_learning_rate}"
-        )
+class Tensor4DDensityModel(BaselineModel[S, Field]):
+    """Colour error, and the schedule of coarse and fine planes."""
 
-    @property
-    def field(self) -> Tensor4D | Tensor4DDensity:
-        return self._field
+    doubted = ("learning_rate", "plane_learning_rate")
 
     def groups(self) -> list[Group]:
         settings, field = self.settings, self._field
@@ -160,28 +149,18 @@ class Tensor4DDensityModel(Model):
                 )
 
 
-class Tensor4DModel(Tensor4DDensityModel):
-    """Colour error, silhouette loss, eikonal loss and smoothness of features.
-
-    Args:
-        settings: Learning rates, schedule and weights.
-        field: The field.
-    """
+class Tensor4DModel(Tensor4DDensityModel[Tensor4DSettings, Tensor4D]):
+    """Colour error, silhouette loss, eikonal loss and smoothness of features."""
 
     def __init__(self, settings: Tensor4DSettings, field: Tensor4D) -> None:
         super().__init__(settings, field)
-        self._field, self.weights = field, settings.loss
         if field.flow_planes is not None:
             field.flow_planes.requires_grad_(settings.flow_planes)
-
-    @property
-    def field(self) -> Tensor4D:
-        return self._field
 
     def losses(
         self, rendering: SurfaceRendering, rays: Batch, state: TrainingState
     ) -> dict[str, Tensor]:
-        weights = self.weights
+        weights = self.settings.loss
         mask = (rays["alpha"] > 0.5).to(rays["target"].dtype)
         compared = mask if weights.masked else torch.ones_like(mask)
         eikonal = eikonal_error(rendering.slopes, len(rendering.samples))
@@ -191,15 +170,12 @@ class Tensor4DModel(Tensor4DDensityModel):
             "silhouette": weights.opacity * silhouette_error(rendering.opacity, mask),
         }
         if weights.smoothness:
-            change = self._change(rendering, len(mask), state)
+            places, features = rendering.places, self._field.features
+            nearby = places + _aside(places, weights.smoothness_distance, state)
+            shares = rendering.weights, len(mask)
+            change = feature_change(features(places), features(nearby), *shares)
             terms["smoothness"] = weights.smoothness * change
         return terms
-
-    def _change(self, rendering: SurfaceRendering, rays: int, state: TrainingState) -> Tensor:
-        places = rendering.places
-        nearby = places + _aside(places, self.weights.smoothness_distance, state)
-        here, there = self._field.features(places), self._field.features(nearby)
-        return feature_change(here, there, rendering.weights, rays)
 
     def scalars(self) -> dict[str, float]:
         return {"surface/sharpness": float(self._field.sharpness.detach())}

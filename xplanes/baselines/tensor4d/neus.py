@@ -8,13 +8,12 @@ from torch import Tensor
 
 from xplanes.baselines.proposal import dense_samples
 from xplanes.baselines.resampling import resample
+from xplanes.baselines.stateless import StatelessSampler
 from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
-from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
-from xplanes.scenes.batches import Batch
+from xplanes.rendering.sampler import SamplerSettings, Site
 from xplanes.settings import Count, Positive
-from xplanes.streams import TrainingState
 
 TINY = 1e-5
 """Added to denominators and weights that may be 0."""
@@ -136,12 +135,7 @@ class NeusRenderer(RayRenderer):
     ) -> Tensor:
         """Ascending distances at which sections begin. [R, samples + more]
 
-        Args:
-            field: As for `render`.
-            origins: [R, 3]
-            directions: Unit directions. [R, 3]
-            times: [R]
-            jitter: Random numbers from 0 to 1 that move uniform samples by up to half a step. [R]
+        Uniform samples are moved by up to half a step, by random numbers ``jitter`` in [0, 1]. [R]
         """
         closest = -(origins * directions).sum(dim=1, keepdim=True)
         steps = torch.linspace(-1, 1, self.samples, device=origins.device)
@@ -183,7 +177,7 @@ class NeusSettings(SamplerSettings):
                 "model/sampler=occupancy or proposal"
             )
 
-    def build(self, field: RadianceField, site: Site) -> "NeusSampler":
+    def build(self, field: RadianceField, site: Site) -> StatelessSampler:
         self.require(field)
         renderer = NeusRenderer(
             field,
@@ -191,33 +185,5 @@ class NeusSettings(SamplerSettings):
             more=self.more_samples,
             coarse_sharpness=self.coarse_sharpness,
         )
-        return NeusSampler(renderer)
-
-
-class NeusSampler(Sampler):
-    """Places samples by the field's signed distance; it has no state to update.
-
-    Args:
-        renderer: The renderer.
-    """
-
-    def __init__(self, renderer: NeusRenderer) -> None:
-        self._renderer = renderer
-
-    @property
-    def renderer(self) -> NeusRenderer:
-        return self._renderer
-
-    @property
-    def outline(self) -> str:
-        return f"{self._renderer.samples} samples a ray, {self._renderer.more} near the surface"
-
-    def render(self, field: Any, rays: Batch, state: TrainingState) -> SurfaceRendering:
-        return self._renderer.render(
-            field,
-            rays["origins"],
-            rays["directions"],
-            rays["times"],
-            rays["background"],
-            rays["jitter"],
-        )
+        outline = f"{self.samples} samples a ray, {self.more_samples} near the surface"
+        return StatelessSampler(renderer, outline)

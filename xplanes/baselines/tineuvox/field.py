@@ -60,13 +60,8 @@ class TiNeuVox(ViewDependentField):
         background: Background | None = None,
     ) -> None:
         super().__init__()
-        self.resolution, self.channels, self.octaves, self.unit = (
-            resolution,
-            channels,
-            octaves,
-            unit,
-        )
-        self._precision = precision
+        self.resolution, self.channels, self.octaves = resolution, channels, octaves
+        self.unit, self._precision = unit, precision
         self.shift = math.log(1 / (1 - alpha) - 1)
         self.register_buffer("box", box)
         self.register_buffer("voxels", torch.tensor(resolution**3 // 2**halvings))
@@ -95,11 +90,7 @@ class TiNeuVox(ViewDependentField):
         """Central slices of the grid. [C, rows, columns] each"""
         grid = self.grid[0]
         x, y, z = (size // 2 for size in grid.shape[1:])
-        return {
-            "xy": grid[:, :, :, z].mT,
-            "xz": grid[:, :, y].mT,
-            "yz": grid[:, x].mT,
-        }
+        return {"xy": grid[:, :, :, z].mT, "xz": grid[:, :, y].mT, "yz": grid[:, x].mT}
 
     @property
     def moves(self) -> bool:

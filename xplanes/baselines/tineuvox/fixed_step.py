@@ -8,16 +8,15 @@ import torch
 from torch import Tensor
 
 from xplanes.baselines.bounds import check_range
+from xplanes.baselines.stateless import StatelessSampler
 from xplanes.errors import ConfigError
 from xplanes.fields.base import RadianceField
 from xplanes.rendering.base import RayRenderer, Rendering
 from xplanes.rendering.behind import behind
 from xplanes.rendering.compositing import composite
 from xplanes.rendering.marching import Samples
-from xplanes.rendering.sampler import Sampler, SamplerSettings, Site
-from xplanes.scenes.batches import Batch
+from xplanes.rendering.sampler import SamplerSettings, Site
 from xplanes.settings import Positive, Range, Weight
-from xplanes.streams import TrainingState
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,8 @@ class FixedStepRendering(Rendering):
 class FixedStepRenderer(RayRenderer):
     """Places samples at equal distances along a ray, from where it enters the field's box.
 
-    Samples with an opacity or weight up to a threshold are dropped and get no colour.
+    They are not jittered. Those with an opacity or weight up to a threshold are dropped and get no
+    colour.
 
     Args:
         field: Field with ``bounds``, ``cell``, ``geometry`` and ``colour``.
@@ -69,7 +69,7 @@ class FixedStepRenderer(RayRenderer):
         directions: Tensor,
         times: Tensor,
         background: Tensor,
-        jitter: None = None,
+        jitter: Any = None,
     ) -> FixedStepRendering:
         step = self.step * field.cell
         box = field.bounds()
@@ -115,14 +115,7 @@ class FixedStepRenderer(RayRenderer):
 
     @torch.no_grad()
     def place(self, origins: Tensor, directions: Tensor, box: Tensor, step: float) -> Samples:
-        """All samples of rays in the box and between near and far.
-
-        Args:
-            origins: [R, 3]
-            directions: Unit directions. [R, 3]
-            box: Least and largest corner. [2, 3]
-            step: Distance between samples.
-        """
+        """All samples of rays [R, 3] in a box [2, 3] and between near and far, ``step`` apart."""
         enter, leave = self.ends(origins, directions, box)
         count = ((leave - enter) / step).ceil().long().clamp_min(1)
         number = torch.arange(int(count.max()) if len(count) else 0, device=count.device)
@@ -171,7 +164,7 @@ class FixedStepSettings(SamplerSettings):
     def bounded(self, near: float, far: float) -> "FixedStepSettings":
         return replace(self, near=near, far=far)
 
-    def build(self, field: RadianceField, site: Site) -> "FixedStepSampler":
+    def build(self, field: RadianceField, site: Site) -> StatelessSampler:
         self.require(field)
         check_range(site, self.near, self.far)
         renderer = FixedStepRenderer(
@@ -181,28 +174,5 @@ class FixedStepSettings(SamplerSettings):
             step=self.step,
             threshold=self.threshold,
         )
-        return FixedStepSampler(renderer)
-
-
-class FixedStepSampler(Sampler):
-    """Places samples at fixed steps, without jitter; it has no state to update.
-
-    Args:
-        renderer: The renderer.
-    """
-
-    def __init__(self, renderer: FixedStepRenderer) -> None:
-        self._renderer = renderer
-
-    @property
-    def renderer(self) -> FixedStepRenderer:
-        return self._renderer
-
-    @property
-    def outline(self) -> str:
-        return f"samples {self._renderer.step:g} cells apart throughout the field's box"
-
-    def render(self, field: Any, rays: Batch, state: TrainingState) -> FixedStepRendering:
-        return self._renderer.render(
-            field, rays["origins"], rays["directions"], rays["times"], rays["background"]
-        )
+        outline = f"samples {self.step:g} cells apart throughout the field's box"
+        return StatelessSampler(renderer, outline)

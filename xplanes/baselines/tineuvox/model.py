@@ -7,12 +7,13 @@ from typing import Annotated, Any, ClassVar
 import torch
 from torch import Tensor
 
+from xplanes.baselines.base import BaselineModel
 from xplanes.baselines.bounds import origin_cube, seen_range
 from xplanes.baselines.tineuvox.field import TiNeuVox
 from xplanes.baselines.tineuvox.fixed_step import FixedStepRendering
 from xplanes.errors import ConfigError
 from xplanes.models.background import BackgroundSettings
-from xplanes.models.base import InitialValues, Model, ModelSettings, colour_error
+from xplanes.models.base import InitialValues, ModelSettings, colour_error
 from xplanes.rendering.base import Rendering
 from xplanes.rendering.sampler import Group, Site
 from xplanes.scenes.batches import Batch
@@ -85,18 +86,17 @@ class TiNeuVoxSettings(ModelSettings):
 
     def build(self, site: Site, initial: InitialValues | None = None) -> "TiNeuVoxModel":
         assert site.bounds is not None
+        octaves = (
+            *(self.point_octaves, self.time_octaves),
+            *(self.direction_octaves, self.feature_octaves),
+        )
         with initial_values(site.seed, Stream.FIELD):
             field = TiNeuVox(
                 site.bounds,
                 self.resolution,
                 self.channels,
                 self.width,
-                octaves=(
-                    self.point_octaves,
-                    self.time_octaves,
-                    self.direction_octaves,
-                    self.feature_octaves,
-                ),
+                octaves=octaves,
                 alpha=self.alpha_start,
                 halvings=len(self.grow_at),
                 moves=site.moves,
@@ -107,26 +107,13 @@ class TiNeuVoxSettings(ModelSettings):
         return TiNeuVoxModel(self, field)
 
 
-class TiNeuVoxModel(Model):
+class TiNeuVoxModel(BaselineModel[TiNeuVoxSettings, TiNeuVox]):
     """Colour error, entropy of the opacity, and colour error of individual samples.
 
     The optimiser's state and the decay of learning rates are reset whenever the grid grows.
-
-    Args:
-        settings: Learning rates, growth and weights.
-        field: The field.
     """
 
-    def __init__(self, settings: TiNeuVoxSettings, field: TiNeuVox) -> None:
-        self._field, self.settings, self.weights = field, settings, settings.loss
-        self.advice = (
-            f"Lower model.grid_learning_rate={settings.grid_learning_rate} or "
-            f"model.network_learning_rate={settings.network_learning_rate}"
-        )
-
-    @property
-    def field(self) -> TiNeuVox:
-        return self._field
+    doubted = ("grid_learning_rate", "network_learning_rate")
 
     @property
     def replaces_parameters(self) -> bool:
@@ -134,14 +121,8 @@ class TiNeuVoxModel(Model):
 
     def groups(self) -> list[Group]:
         settings, field = self.settings, self._field
-        groups: list[Group] = [
-            {
-                "params": [field.grid],
-                "lr": settings.grid_learning_rate,
-                "name": "grid",
-                "masked": True,
-            }
-        ]
+        grid = {"params": [field.grid], "lr": settings.grid_learning_rate, "name": "grid"}
+        groups: list[Group] = [grid | {"masked": True}]
         for name, part in field.named_children():
             if part is field.background:
                 continue
@@ -175,15 +156,15 @@ class TiNeuVoxModel(Model):
             self.settings.background.regularise(self._field.background)
 
     def losses(self, rendering: Rendering, rays: Batch, state: TrainingState) -> dict[str, Tensor]:
+        weights = self.settings.loss
         terms = {
             "colour": colour_error(rendering, rays),
-            "entropy": self.weights.entropy * light_entropy(rendering.opacity),
+            "entropy": weights.entropy * light_entropy(rendering.opacity),
         }
         if isinstance(rendering, FixedStepRendering):
-            spread = sample_colour_error(
-                rendering.colours, rays["target"], rendering.weights, rendering.ray
-            )
-            terms["sample_colour"] = self.weights.sample_colour * spread
+            samples = rendering.weights, rendering.ray
+            spread = sample_colour_error(rendering.colours, rays["target"], *samples)
+            terms["sample_colour"] = weights.sample_colour * spread
         if self._field.background is not None and self.settings.background is not None:
             terms |= self.settings.background.losses(self._field.background, rendering, rays, state)
         return terms

@@ -10,10 +10,11 @@ from torch.nn.functional import normalize
 
 from xplanes.synthetic.demo.geometry import Primitive, Surface
 from xplanes.synthetic.demo.motions import Motion, Steady
-from xplanes.synthetic.demo.posed import Hits, Posed, PosedPart
+from xplanes.synthetic.demo.posed import Posed, PosedPart
 from xplanes.synthetic.demo.shading import Light
 
 Vector = tuple[float, float, float]
+Kind = Literal["fixed", "hinge", "slide", "scale"]
 
 WORLD = "world"
 """The root of every tree of joints."""
@@ -38,7 +39,7 @@ class Joint:
     parent: str = WORLD
     position: Vector = (0.0, 0.0, 0.0)
     rotation: Vector = (0.0, 0.0, 0.0)
-    kind: Literal["fixed", "hinge", "slide", "scale"] = "fixed"
+    kind: Kind = "fixed"
     axis: Vector = (0.0, 0.0, 1.0)
     motion: Motion | None = None
 
@@ -112,18 +113,6 @@ class Assembly:
             shape, surface = part.shape.at(time), part.surface.at(time)
             posed.append(PosedPart(shape, surface, frame[:3, :3], frame[:3, 3], scale))
         return Posed(tuple(posed), self.light)
-
-    def cast(self, origins: Tensor, directions: Tensor, time: float) -> Hits:
-        """First hit of each ray (origins and unit directions [N, 3]) at ``time``."""
-        return self.pose(time).cast(origins, directions)
-
-    def inside(self, points: Tensor, time: float) -> Tensor:
-        """Whether points [N, 3] lie inside any part at ``time``. bool [N]"""
-        return self.pose(time).inside(points)
-
-    def colour(self, points: Tensor, time: float) -> Tensor:
-        """Unlit colours of the nearest part at points [N, 3] at ``time``. [N, 3]"""
-        return self.pose(time).colour(points)
 
 
 def _require(name: str, known: set[str], role: str) -> None:

@@ -79,12 +79,12 @@ class Rig:
             counts: Number of views per split; times of ``train`` are evenly spaced.
             seed: Seed; each split has its own random stream.
         """
-        shots = {}
+        shots, target = {}, torch.tensor(self.target, dtype=torch.float64)
         for split, count in counts.items():
             draw = random.Random(f"{seed} {split}")
             stations = self._stations(count, draw, seed, training=split == "train")
             shots[split] = [
-                (time * self.end, self._camera(azimuth, elevation))
+                (time * self.end, camera_around(azimuth, elevation, self.distance, target))
                 for time, azimuth, elevation in stations
             ]
         return Capture(shots, self.angle_x, self.samples)
@@ -94,20 +94,15 @@ class Rig:
     ) -> list[Station]:
         """Times and places of the views of a split."""
         if self.fixed is not None:
-            places = self._fixed(self.fixed, random.Random(f"{seed} fixed"))
-            places = (
-                [places[i % self.fixed] for i in range(count)]
-                if training
-                else [self._between(places, draw) for _ in range(count)]
-            )
+            fixed = self._fixed(self.fixed, random.Random(f"{seed} fixed"))
+            places = [
+                fixed[i % self.fixed] if training else self._between(fixed, draw)
+                for i in range(count)
+            ]
         else:
             places = [self._anywhere(draw) for _ in range(count)]
         times = even_times(count) if training else held_out_times(count, draw)
         return [(time, *place) for time, place in zip(times, places, strict=True)]
-
-    def _camera(self, azimuth: float, elevation: float) -> Tensor:
-        target = torch.tensor(self.target, dtype=torch.float64)
-        return camera_around(azimuth, elevation, self.distance, target)
 
     def _anywhere(self, draw: random.Random) -> tuple[float, float]:
         """Azimuth and elevation, uniformly distributed over the region of the sphere."""
@@ -131,9 +126,8 @@ class Rig:
         self, places: Sequence[tuple[float, float]], draw: random.Random
     ) -> tuple[float, float]:
         """Azimuth and elevation between two neighbouring cameras."""
-        first = draw.randrange(
-            len(places) if self.azimuths[1] - self.azimuths[0] >= 360 else len(places) - 1
-        )
+        closed = self.azimuths[1] - self.azimuths[0] >= 360
+        first = draw.randrange(len(places) if closed else len(places) - 1)
         (left, low), (right, high) = places[first], places[(first + 1) % len(places)]
         if right < left:
             right += 360

@@ -3,6 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import ClassVar, Self
 
 import torch
@@ -24,9 +25,9 @@ class Primitive(ABC):
         """Half sides of the shape's bounding box, in its own axes. [3]"""
 
     @property
-    @abstractmethod
     def radius_around(self) -> float:
         """Radius of the shape's bounding sphere around its centre."""
+        return math.hypot(*self.extent)
 
     @abstractmethod
     def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
@@ -60,23 +61,6 @@ class Primitive(ABC):
         """Whether points lie inside the shape. bool [N]"""
         return self.signed_distance(points) < 0
 
-    def intersect(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """First hit of each ray: distance (inf for a miss) and normal (0 for a miss).
-
-        Args:
-            origins: Ray origins. [N, 3]
-            directions: Unit directions. [N, 3]
-
-        Returns:
-            Distances and outward unit normals. [N], [N, 3]
-        """
-        distance = self.hit(origins, directions)
-        found = distance.isfinite()
-        normal = torch.zeros_like(directions)
-        points = origins[found] + distance[found, None] * directions[found]
-        normal[found] = self.normal(points)
-        return distance, normal
-
 
 @dataclass(frozen=True)
 class Box(Primitive):
@@ -88,29 +72,17 @@ class Box(Primitive):
     def extent(self) -> tuple[float, float, float]:
         return self.half
 
-    @property
-    def radius_around(self) -> float:
-        return math.hypot(*self.half)
-
     def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
-        near, far = zip(
-            *(
-                _slab(origins[:, axis], directions[:, axis], half)
-                for axis, half in enumerate(self.half)
-            ),
-            strict=True,
-        )
-        return _first(
-            torch.maximum(torch.maximum(near[0], near[1]), near[2]),
-            torch.minimum(torch.minimum(far[0], far[1]), far[2]),
-        )
+        axes = zip(origins.unbind(dim=-1), directions.unbind(dim=-1), self.half, strict=True)
+        near, far = zip(*(_slab(*axis) for axis in axes), strict=True)
+        return _first(reduce(torch.maximum, near), reduce(torch.minimum, far))
 
     def normal(self, points: Tensor) -> Tensor:
         axis = (points.abs() - points.new_tensor(self.half)).argmax(dim=-1, keepdim=True)
         return torch.zeros_like(points).scatter(-1, axis, points.gather(-1, axis).sign())
 
     def signed_distance(self, points: Tensor) -> Tensor:
-        return _corner_distance(points.abs() - points.new_tensor(self.half))
+        return corner_distance(points.abs() - points.new_tensor(self.half))
 
 
 @dataclass(frozen=True)
@@ -172,7 +144,7 @@ class Cylinder(Primitive):
 
     def signed_distance(self, points: Tensor) -> Tensor:
         side = points[:, :2].norm(dim=-1) - self.radius
-        return _corner_distance(torch.stack([side, points[:, 2].abs() - self.half_height], dim=-1))
+        return corner_distance(torch.stack([side, points[:, 2].abs() - self.half_height], dim=-1))
 
 
 @dataclass(frozen=True)
@@ -252,7 +224,7 @@ def cylinder_span(
     return torch.where(hit, near, MISS), torch.where(hit, far, -MISS)
 
 
-def _corner_distance(out: Tensor) -> Tensor:
+def corner_distance(out: Tensor) -> Tensor:
     """Signed distance from the signed excess along orthogonal directions. [N]"""
     return out.clamp_min(0).norm(dim=-1) + out.amax(dim=-1).clamp_max(0)
 
@@ -381,21 +353,27 @@ class Bricks(Surface):
 
 
 @dataclass(frozen=True)
-class Unlit(Surface):
-    """A surface without shading."""
+class Derived(Surface):
+    """A surface with the colours of another one."""
 
     base: Surface
-    lit: ClassVar[bool] = False
 
-    def at(self, time: float) -> "Unlit":
-        return Unlit(self.base.at(time))
+    def at(self, time: float) -> Self:
+        return replace(self, base=self.base.at(time))
 
     def colour(self, points: Tensor) -> Tensor:
         return self.base.colour(points)
 
 
 @dataclass(frozen=True)
-class Translucent(Surface):
+class Unlit(Derived):
+    """A surface without shading."""
+
+    lit: ClassVar[bool] = False
+
+
+@dataclass(frozen=True)
+class Translucent(Derived):
     """A thin semi-transparent shell around a homogeneous absorbing medium.
 
     Attributes:
@@ -404,15 +382,8 @@ class Translucent(Surface):
         density: Density of the medium, per unit length.
     """
 
-    base: Surface
     shell: float = 0.0
     density: float = 0.0
-
-    def at(self, time: float) -> "Translucent":
-        return replace(self, base=self.base.at(time))
-
-    def colour(self, points: Tensor) -> Tensor:
-        return self.base.colour(points)
 
     def opacity(self, cosine: Tensor) -> Tensor:
         """Opacity of the shell, given cosines of the angle to the normal. [N]"""

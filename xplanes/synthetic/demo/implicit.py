@@ -2,6 +2,7 @@
 
 import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
@@ -9,7 +10,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from xplanes.synthetic.demo.geometry import MISS, Box, Colour, Primitive, Surface
+from xplanes.synthetic.demo.geometry import (
+    MISS,
+    Box,
+    Colour,
+    Primitive,
+    Surface,
+    corner_distance,
+)
 from xplanes.synthetic.demo.motions import Motion
 
 STEPS = 48
@@ -43,10 +51,6 @@ class Implicit(Primitive):
     @abstractmethod
     def value(self, points: Tensor) -> Tensor:
         """Negative inside; outside, positive and at most the distance to the surface. [N]"""
-
-    @property
-    def radius_around(self) -> float:
-        return math.hypot(*self.extent)
 
     def hit(self, origins: Tensor, directions: Tensor) -> Tensor:
         half = self.extent
@@ -223,9 +227,7 @@ class Twisted(Implicit):
         return torch.stack([cosine * x + sine * y, cosine * y - sine * x, z], dim=-1)
 
     def value(self, points: Tensor) -> Tensor:
-        inner = points.new_tensor([side - self.rounding for side in self.half])
-        out = self.material(points).abs() - inner
-        gap = out.clamp_min(0).norm(dim=-1) + out.amax(dim=-1).clamp_max(0) - self.rounding
+        gap = _rounded_box(self.material(points), self.half, self.rounding)
         # The corners of the bounding box have the largest distance to the axis.
         return gap / _shear(abs(self._rate()) * math.sqrt(2) * math.hypot(*self.half[:2]))
 
@@ -326,10 +328,7 @@ class Waving(Implicit):
         return torch.stack([x, y - self.reach * share * angle.sin(), z], dim=-1)
 
     def value(self, points: Tensor) -> Tensor:
-        rounding = 0.8 * self.half[1]
-        inner = points.new_tensor([side - rounding for side in self.half])
-        out = self.material(points).abs() - inner
-        gap = out.clamp_min(0).norm(dim=-1) + out.amax(dim=-1).clamp_max(0) - rounding
+        gap = _rounded_box(self.material(points), self.half, 0.8 * self.half[1])
         return gap / _shear(self.reach * (2 * math.pi * self.waves + 1) / (2 * self.half[0]))
 
 
@@ -376,6 +375,12 @@ class Lobed(Implicit):
         # The bound may fail near the centre, which lies deep inside.
         slope = math.hypot(1.0, abs(swell) * (self.lobes + 2) / (1 - abs(swell)))
         return gap / (slope * max(math.sqrt(height), 1 / height))
+
+
+def _rounded_box(points: Tensor, half: Sequence[float], rounding: float) -> Tensor:
+    """Signed distance to a box with rounded edges. [N]"""
+    inner = points.new_tensor([side - rounding for side in half])
+    return corner_distance(points.abs() - inner) - rounding
 
 
 def _shear(slope: float) -> float:

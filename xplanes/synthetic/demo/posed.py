@@ -1,7 +1,8 @@
 """Posed solids: ray casting and point queries in world coordinates."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -44,15 +45,6 @@ class PosedPart:
         own = directions @ self.rotation.to(directions)
         return self.shape.hit(self.to_own(origins), own) * self.scale
 
-    def signed_distance(self, points: Tensor) -> Tensor:
-        """Distance of world points to the part, negative inside. [N]"""
-        return self.shape.signed_distance(self.to_own(points)) * self.scale
-
-    @property
-    def radius_around(self) -> float:
-        """Radius of the bounding sphere around the part's centre."""
-        return self.shape.radius_around * self.scale
-
     def inside(self, points: Tensor) -> Tensor:
         """Whether world points lie inside the part. bool [N]"""
         return self.shape.inside(self.to_own(points))
@@ -89,18 +81,23 @@ class Posed:
 
     parts: tuple[PosedPart, ...]
     light: Light | None = None
-    _centres: Tensor = field(init=False, repr=False, compare=False)
-    _radii: Tensor = field(init=False, repr=False, compare=False)
-    _lit: Tensor = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not self.parts:
             raise ValueError("an assembly needs at least one part")
-        object.__setattr__(self, "_centres", torch.stack([p.translation for p in self.parts]))
-        radii = torch.tensor([p.radius_around for p in self.parts])
-        object.__setattr__(self, "_radii", radii)
-        lit = torch.tensor([p.surface.lit for p in self.parts])
-        object.__setattr__(self, "_lit", lit)
+
+    @cached_property
+    def _centres(self) -> Tensor:
+        return torch.stack([part.translation for part in self.parts])
+
+    @cached_property
+    def _radii(self) -> Tensor:
+        """Radii of the parts' bounding spheres."""
+        return torch.tensor([part.shape.radius_around * part.scale for part in self.parts])
+
+    @cached_property
+    def _lit(self) -> Tensor:
+        return torch.tensor([part.surface.lit for part in self.parts])
 
     def cast(self, origins: Tensor, directions: Tensor) -> Hits:
         """First hit of each ray.
@@ -202,30 +199,6 @@ class Posed:
         result = torch.zeros(len(points), dtype=torch.bool, device=points.device)
         for part in self.parts:
             result |= part.inside(points)
-        return result
-
-    def signed_distance(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance to the nearest part, and that part's index. [N], [N]"""
-        gaps = torch.stack([p.signed_distance(points) for p in self.parts])
-        distance, part = gaps.min(dim=0)
-        return distance, part
-
-    def colour(self, points: Tensor, part: Tensor | None = None) -> Tensor:
-        """Unlit colours.
-
-        Args:
-            points: Positions. [N, 3]
-            part: Index of the part at each point; the nearest part when None. [N]
-
-        Returns:
-            Colours in [0, 1]. [N, 3]
-        """
-        if part is None:
-            part = self.signed_distance(points)[1]
-        result = torch.zeros_like(points)
-        for number in part.unique().tolist():
-            chosen = (part == number).nonzero()[:, 0]
-            result[chosen] = self.parts[number].colour(points[chosen])
         return result
 
     def bounds(self) -> tuple[Tensor, Tensor]:

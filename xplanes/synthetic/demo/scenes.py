@@ -149,12 +149,7 @@ def _tracks(dark: Colour, steel: Colour) -> list[Part]:
     return parts
 
 
-def _house(
-    variation: Variation,
-    yellow: Colour,
-    dark: Colour,
-    steel: Colour,
-) -> list[Part]:
+def _house(variation: Variation, yellow: Colour, dark: Colour, steel: Colour) -> list[Part]:
     glass = variation.natural("#6fb3d3")
     return [
         Part(Box((0.4, 0.28, 0.05)), Plain(dark), "slew", (-0.06, 0.0, 0.055)),
@@ -172,13 +167,8 @@ def _house(
     ]  # fmt: skip
 
 
-def _limbs(
-    yellow: Colour,
-    dark: Colour,
-    steel: Colour,
-) -> list[Part]:
+def _limbs(yellow: Colour, dark: Colour, steel: Colour) -> list[Part]:
     bar = Stripes((yellow, dark), 0, 0.085, 0.0)
-    pins = [("boom", 0.0), ("bend", 0.0), ("arm", 0.0), ("bucket", 0.0)]
     parts = [
         Part(Box((0.19, 0.055, 0.075)), Plain(yellow), "boom", (0.18, 0.0, 0.0)),
         Part(Box((0.21, 0.05, 0.062)), Plain(yellow), "bend", (0.2, 0.0, 0.0)),
@@ -193,13 +183,14 @@ def _limbs(
         Part(Box((0.1, 0.012, 0.09)), Plain(dark), "bucket", (0.1, 0.13, -0.035)),
         Part(Box((0.1, 0.012, 0.09)), Plain(dark), "bucket", (0.1, -0.13, -0.035)),
     ]
-    for joint, x in pins:
-        parts.append(Part(Cylinder(0.06, 0.075), Plain(steel), joint, (x, 0, 0), (90, 0, 0)))
-    tooth = Box((0.035, 0.016, 0.01))
-    teeth = [
-        Part(tooth, Plain(steel), "bucket", (0.03, y, -0.13)) for y in (-0.1, -0.033, 0.033, 0.1)
-    ]
-    return parts + teeth
+    pin, tooth = Cylinder(0.06, 0.075), Box((0.035, 0.016, 0.01))
+    return [
+        *parts,
+        *(Part(pin, Plain(steel), joint, (0.0, 0, 0), (90, 0, 0))
+          for joint in ("boom", "bend", "arm", "bucket")),
+        *(Part(tooth, Plain(steel), "bucket", (0.03, y, -0.13))
+          for y in (-0.1, -0.033, 0.033, 0.1)),
+    ]  # fmt: skip
 
 
 _SIDES = (("left", 1.0, 0.0), ("right", -1.0, 0.5))

@@ -8,9 +8,9 @@ import secrets
 import shutil
 import threading
 from abc import ABC
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import time as now
 from typing import Any, ClassVar, Literal
@@ -56,6 +56,56 @@ VIDEO_FRAMES = 50
 _RENDERING = threading.Lock()
 
 
+@dataclass(frozen=True)
+class Shoot:
+    """What is rendered to a scene's folder.
+
+    Attributes:
+        title: Name in messages.
+        assembly: The scene.
+        capture: Times and cameras.
+        version: Version of the images.
+        record: What else the images depend on, besides seed, resolution and numbers of views.
+        world: Surroundings; None for images of the assembly alone.
+    """
+
+    title: str
+    assembly: Assembly
+    capture: Capture
+    version: int
+    record: dict[str, str]
+    world: World | None = None
+
+
+def _demo_shoot(name: str, seed: int, counts: dict[str, int]) -> Shoot:
+    assembly = build_demo_scene(name, seed)
+    # Parts and motions are hashed, so that an edited scene is rendered again.
+    record = {"assembly": _digest(assembly)}
+    shots = {}
+    for split, count in counts.items():
+        draw = random.Random(f"{split} {seed}")  # A stream for each split.
+        cameras = hemisphere_cameras(count, draw)
+        times = even_times(count) if split == "train" else held_out_times(count, draw)
+        shots[split] = list(zip(times, cameras, strict=True))
+    camera = camera_at(demo_scene(name).azimuth, 0.0)
+    shots["video"] = [(time, camera) for time in even_times(VIDEO_FRAMES)]
+    return Shoot(f"demo scene {name}", assembly, Capture(shots), VERSION, record)
+
+
+def _suite_shoot(name: str, seed: int, counts: dict[str, int]) -> Shoot:
+    scene, variation = suite_scene(name), Variation(name, seed)
+    assembly = scene.build(variation)
+    world = None if scene.world is None else scene.world(assembly, variation)
+    capture = scene.rig.capture(counts, f"{name} {seed}")
+    around = () if world is None else (world,)
+    record = {"content": _digest((SUITE_VERSION, assembly, scene.rig, *around))}
+    return Shoot(f"suite scene {name}", assembly, capture, SUITE_VERSION, record, world)
+
+
+def _digest(content: object) -> str:
+    return hashlib.sha256(repr(content).encode()).hexdigest()
+
+
 def ensure_demo_scene(
     root: Path,
     name: str,
@@ -66,6 +116,7 @@ def ensure_demo_scene(
     val_views: int = USUAL_VIEWS["val"],
     test_views: int = USUAL_VIEWS["test"],
     announce: Callable[[str], None] | None = None,
+    shoot: Callable[[str, int, dict[str, int]], Shoot] = _demo_shoot,
 ) -> Path:
     """Render a demo scene unless its folder exists already.
 
@@ -80,6 +131,7 @@ def ensure_demo_scene(
         val_views: Number of validation views.
         test_views: Number of test views.
         announce: Receives a message before rendering; `print` when None.
+        shoot: What is rendered, from name, seed and number of views per split.
 
     Returns:
         The scene's folder.
@@ -88,103 +140,31 @@ def ensure_demo_scene(
         ValueError: If no scene has that name, or a count is below 1.
     """
     counts = {"train": train_views, "val": val_views, "test": test_views}
-    _require_some(resolution, counts)
-    assembly = build_demo_scene(name, seed)
-    record = {
-        "version": VERSION,
-        "scene": name,
-        "seed": seed,
-        "resolution": resolution,
-        "views": {**counts, "video": VIDEO_FRAMES},
-        # Parts and motions are hashed, so that an edited scene is rendered again.
-        "assembly": hashlib.sha256(repr(assembly).encode()).hexdigest(),
-    }
-    return _ensure(
-        Path(root) / _folder_name(name, resolution, seed, counts),
-        f"demo scene {name}",
-        assembly,
-        _demo_capture(name, seed, counts),
-        record,
-        announce or print,
-    )
-
-
-def ensure_suite_scene(
-    root: Path,
-    name: str,
-    *,
-    resolution: int,
-    seed: int = 0,
-    train_views: int = USUAL_VIEWS["train"],
-    val_views: int = USUAL_VIEWS["val"],
-    test_views: int = USUAL_VIEWS["test"],
-    announce: Callable[[str], None] | None = None,
-) -> Path:
-    """Render a scene of the suite unless its folder exists already.
-
-    Arguments, folder and errors are those of `ensure_demo_scene`. There is no fixed-view video.
-    Objects with surroundings have opaque images, and masks of the object in ``masks``. Only scores
-    may use these masks, unless ``mask_use`` says otherwise.
-    """
-    counts = {"train": train_views, "val": val_views, "test": test_views}
-    _require_some(resolution, counts)
-    scene = suite_scene(name)
-    variation = Variation(name, seed)
-    assembly = scene.build(variation)
-    world = None if scene.world is None else scene.world(assembly, variation)
-    capture = scene.rig.capture(counts, f"{name} {seed}")
-    around = () if world is None else (world,)
-    content = repr((SUITE_VERSION, assembly, scene.rig, *around))
-    record = {
-        "version": SUITE_VERSION,
-        "scene": name,
-        "seed": seed,
-        "resolution": resolution,
-        "views": counts,
-        "content": hashlib.sha256(content.encode()).hexdigest(),
-    }
-    return _ensure(
-        Path(root) / _folder_name(name, resolution, seed, counts),
-        f"suite scene {name}",
-        assembly,
-        capture,
-        record,
-        announce or print,
-        world,
-    )
-
-
-def _require_some(resolution: int, counts: dict[str, int]) -> None:
-    for key, value in {
-        "resolution": resolution,
-        **{f"{k}_views": v for k, v in counts.items()},
-    }.items():
+    numbers = {"resolution": resolution, **{f"{key}_views": n for key, n in counts.items()}}
+    for key, value in numbers.items():
         if value < 1:
             raise ValueError(f"{key} is {value}; it must be at least 1")
-
-
-def _ensure(
-    folder: Path,
-    title: str,
-    assembly: Assembly,
-    capture: Capture,
-    record: dict[str, Any],
-    announce: Callable[[str], None],
-    world: World | None = None,
-) -> Path:
-    """Render a scene to a folder unless the folder matches the record."""
-    masked = world is not None
+    made = shoot(name, seed, counts)
+    views = {split: len(shots) for split, shots in made.capture.shots.items()}
+    asked = {"version": made.version, "scene": name, "seed": seed, "resolution": resolution}
+    record = {**asked, "views": views, **made.record}
+    suffix = "" if counts == USUAL_VIEWS else "_" + "-".join(map(str, counts.values()))
+    folder = Path(root) / f"{name}_{resolution}px_s{seed}{suffix}"
+    masked = made.world is not None
     if _holds(folder, record, masked):
         return folder
-    total, resolution = sum(record["views"].values()), record["resolution"]
-    announce(f"Rendering {title} ({total} images of {resolution} px) to {folder}")
+    total = sum(views.values())
+    (announce or print)(f"Rendering {made.title} ({total} images of {resolution} px) to {folder}")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    _clear_unfinished(folder)
+    for path in folder.parent.glob(f".{folder.name}.*"):  # Abandoned by other processes.
+        if now() - path.stat().st_mtime > DAY:
+            shutil.rmtree(path, ignore_errors=True)
     fresh = _sibling(folder)
     try:
-        with _one_thread():
-            for split in capture.shots:
-                _write_split(fresh, split, capture, assembly, resolution, world)
+        # Parallelising many small operations in torch costs more than it gains.
+        with _RENDERING, threads(1):
+            for split in views:
+                _write_split(fresh, split, made, resolution)
         (fresh / RECORD).write_text(json.dumps(record, indent=2) + "\n")
         _publish(fresh, folder, record, masked)
     finally:
@@ -192,27 +172,16 @@ def _ensure(
     return folder
 
 
-def _demo_capture(name: str, seed: int, counts: dict[str, int]) -> Capture:
-    """Times and cameras of a demo scene; each split has its own random stream."""
-    shots = {}
-    for split, count in counts.items():
-        draw = random.Random(f"{split} {seed}")
-        cameras = hemisphere_cameras(count, draw)
-        times = even_times(count) if split == "train" else held_out_times(count, draw)
-        shots[split] = list(zip(times, cameras, strict=True))
-    camera = camera_at(demo_scene(name).azimuth, 0.0)
-    shots["video"] = [(time, camera) for time in even_times(VIDEO_FRAMES)]
-    return Capture(shots)
+ensure_suite_scene = partial(ensure_demo_scene, shoot=_suite_shoot)
+"""Render a scene of the suite unless its folder exists already; see `ensure_demo_scene`.
+
+There is no fixed-view video. Objects with surroundings have opaque images, and masks of the object
+in ``masks``. Only scores may use these masks, unless ``mask_use`` says otherwise.
+"""
 
 
-def _write_split(
-    folder: Path,
-    split: str,
-    capture: Capture,
-    assembly: Assembly,
-    resolution: int,
-    world: World | None,
-) -> None:
+def _write_split(folder: Path, split: str, shoot: Shoot, resolution: int) -> None:
+    capture, world = shoot.capture, shoot.world
     (folder / split).mkdir()
     if world is not None:
         (folder / MASKS / split).mkdir(parents=True)
@@ -221,26 +190,14 @@ def _write_split(
         file = f"./{split}/r_{number:03d}"
         how = (camera, resolution, capture.samples, capture.angle_x)
         if world is None:
-            image = render_image(assembly.pose(time), *how)
+            image = render_image(shoot.assembly.pose(time), *how)
         else:
-            image, mask = world.picture(assembly, time, *how)
+            image, mask = world.picture(shoot.assembly, time, *how)
             Image.fromarray(mask).save(folder / MASKS / f"{file}.png", compress_level=6)
         Image.fromarray(image).save(folder / f"{file}.png", compress_level=6)
         frames.append({"file_path": file, "time": time, "transform_matrix": camera.tolist()})
     index = {"camera_angle_x": capture.angle_x, "frames": frames}
     (folder / f"transforms_{split}.json").write_text(json.dumps(index, indent=1) + "\n")
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Limit PyTorch to one thread: parallelising many small operations costs more than it gains."""
-    with _RENDERING, threads(1):
-        yield
-
-
-def _folder_name(name: str, resolution: int, seed: int, counts: dict[str, int]) -> str:
-    suffix = "" if counts == USUAL_VIEWS else "_" + "-".join(map(str, counts.values()))
-    return f"{name}_{resolution}px_s{seed}{suffix}"
 
 
 def _holds(folder: Path, record: dict[str, Any], masked: bool) -> bool:
@@ -267,13 +224,6 @@ def _sibling(folder: Path) -> Path:
     sibling = folder.with_name(f".{folder.name}.{os.getpid()}.{secrets.token_hex(4)}")
     sibling.mkdir()
     return sibling
-
-
-def _clear_unfinished(folder: Path) -> None:
-    """Remove abandoned temporary folders next to ``folder``."""
-    for path in folder.parent.glob(f".{folder.name}.*"):
-        if now() - path.stat().st_mtime > DAY:
-            shutil.rmtree(path, ignore_errors=True)
 
 
 def _publish(fresh: Path, folder: Path, record: dict[str, Any], masked: bool) -> None:
@@ -329,7 +279,13 @@ class ProceduralSettings(SceneSettings, ABC):
         folder = self.folder
         try:
             scene = read_scene(self, splits)
-            return _with_masks(scene, folder / MASKS)
+            if not (folder / MASKS).is_dir():
+                return scene
+            found = {}
+            for split, views in scene.splits.items():
+                masks = load_images([folder / MASKS / file for file in views.files], None)
+                found[split] = replace(views, foreground=masks[..., 0])
+            return replace(scene, splits=found)
         except SceneError as problem:
             if str(problem).startswith("data."):  # What is wrong is a setting, not the files.
                 raise
@@ -338,31 +294,18 @@ class ProceduralSettings(SceneSettings, ABC):
             ) from problem
 
 
-def _with_masks(scene: Scene, folder: Path) -> Scene:
-    """The scene with the masks of its object, if it has surroundings."""
-    if not folder.is_dir():
-        return scene
-    splits = {}
-    for split, views in scene.splits.items():
-        masks = load_images([folder / file for file in views.files], None)
-        splits[split] = replace(views, foreground=masks[..., 0])
-    return replace(scene, splits=splits)
-
-
 @dataclass(frozen=True, kw_only=True)
 class DemoSettings(ProceduralSettings):
     """A procedural scene, rendered on first use."""
 
-    find = staticmethod(demo_scene)
-    ensure = staticmethod(ensure_demo_scene)
+    find, ensure = staticmethod(demo_scene), staticmethod(ensure_demo_scene)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteSettings(ProceduralSettings):
     """A procedural scene of the suite, rendered on first use."""
 
-    find = staticmethod(suite_scene)
-    ensure = staticmethod(ensure_suite_scene)
+    find, ensure = staticmethod(suite_scene), staticmethod(ensure_suite_scene)
 
     # Foreground masks, used for scores. alpha: also as training alpha; lrm: also for LRM input.
     mask_use: Literal["score", "alpha", "lrm"]

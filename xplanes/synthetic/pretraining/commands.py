@@ -8,25 +8,11 @@ from xplanes.process import say
 
 def add_commands(commands: "argparse._SubParsersAction") -> None:
     """Add both commands to the command line; heavy modules are imported when they run."""
-    _add_pretrain(commands)
-    _add_score(commands)
-
-
-def _add_pretrain(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser("pretrain-lrm", help="train a small LRM on procedural objects")
     parser.add_argument(
         "overrides", nargs="*", metavar="key=value", help="settings of conf/pretrain_lrm.yaml"
     )
     parser.set_defaults(command=_pretrain)
-
-
-def _pretrain(options: argparse.Namespace) -> None:
-    from xplanes.synthetic.pretraining.run import run_pretraining
-
-    say(f"wrote {run_pretraining(options.overrides, say)}")
-
-
-def _add_score(commands: "argparse._SubParsersAction") -> None:
     parser = commands.add_parser("score-lrm", help="evaluate a small LRM on held-out objects")
     parser.add_argument("model", help="tiny, mini, or FOLDER/NAME.safetensors")
     parser.add_argument(
@@ -39,6 +25,12 @@ def _add_score(commands: "argparse._SubParsersAction") -> None:
         help="output folder; default: %(default)s",
     )
     parser.set_defaults(command=_score)
+
+
+def _pretrain(options: argparse.Namespace) -> None:
+    from xplanes.synthetic.pretraining.run import run_pretraining
+
+    say(f"wrote {run_pretraining(options.overrides, say)}")
 
 
 def _score(options: argparse.Namespace) -> None:

@@ -44,7 +44,6 @@ def init_model(config: LRMConfig, seed: int) -> OpenLRM:
             nn.init.normal_(module.weight, std=fan**-0.5, generator=generator)
             assert module.bias is not None
             nn.init.zeros_(module.bias)
-    places = _places(config)
     with torch.no_grad():
         for block in [*model.encoder.blocks, *model.blocks]:
             for name, child in block.named_modules():  # residual branches are initialised small
@@ -58,8 +57,8 @@ def init_model(config: LRMConfig, seed: int) -> OpenLRM:
             _compare(block.self_attention, SELF_SHARPNESS)  # type: ignore[arg-type]
             for norm in (block.norm1, block.norm2, block.norm3):
                 nn.init.zeros_(norm.modulation[1].weight)  # type: ignore[index]
-        model.encoder.position[0, 1:] = _patch_places(config, places)
-        model.position[0] = 0.5 * _plane_places(config, places)
+        model.encoder.position[0, 1:] = _patch_places(config)
+        model.position[0] = 0.5 * _plane_places(config)
         for layer in model.decoder.layers[:-1]:  # ReLU drops half of the variance
             layer.weight.mul_(2**0.5)  # type: ignore[operator]
     return model
@@ -71,44 +70,34 @@ def _compare(attention: nn.Module, sharpness: float) -> None:
         linear.weight.copy_(sharpness * torch.eye(*linear.weight.shape))  # type: ignore[union-attr]
 
 
-def _places(config: LRMConfig) -> tuple[range, int]:
-    """First channel of each axis within a head, and the number of frequencies per axis."""
-    width = config.head_width
-    waves = width // NARROWEST
-    return range(0, 6 * waves, 2 * waves), waves
-
-
-def _wave(values: Tensor, axis: int, config: LRMConfig, places: tuple[range, int]) -> Tensor:
+def _wave(values: Tensor, axis: int, config: LRMConfig) -> Tensor:
     """Sines and cosines of a coordinate, in its axis's channels of every head. [T] -> [T, D]"""
-    starts, waves = places
+    waves = config.head_width // NARROWEST
     frequencies = SLOWEST * (FASTEST / SLOWEST) ** torch.linspace(0, 1, waves)
     phases = values[:, None] * frequencies
     code = torch.zeros(len(values), config.heads, config.head_width)
-    span = slice(starts[axis], starts[axis] + 2 * waves)
-    code[:, :, span] = torch.cat([phases.sin(), phases.cos()], dim=-1)[:, None]
+    code[:, :, 2 * waves * axis : 2 * waves * (axis + 1)] = torch.cat(
+        [phases.sin(), phases.cos()], dim=-1
+    )[:, None]
     return code.flatten(1)
 
 
-def _patch_places(config: LRMConfig, places: tuple[range, int]) -> Tensor:
+def _patch_places(config: LRMConfig) -> Tensor:
     """Position embedding of the image patches, at the plane through the centre. [G G, D]"""
     side = config.encoder.grid
     reach = 0.5 * config.source_distance / config.source_focal
     line = reach * (2 * (torch.arange(side) + 0.5) / side - 1)
     down, right = torch.meshgrid(-line, line, indexing="ij")
-    return _wave(right.flatten(), 0, config, places) + _wave(down.flatten(), 2, config, places)
+    return _wave(right.flatten(), 0, config) + _wave(down.flatten(), 2, config)
 
 
-def _plane_places(config: LRMConfig, places: tuple[range, int]) -> Tensor:
+def _plane_places(config: LRMConfig) -> Tensor:
     """Position embedding of the tokens of planes xy, xz and zy, row by row. [3 R R, D]"""
     side = config.low_resolution
     line = 2 * (torch.arange(side) + 0.5) / side - 1
     rows, columns = (part.flatten() for part in torch.meshgrid(line, line, indexing="ij"))
-    return torch.cat(
-        [
-            _wave(columns, column, config, places) + _wave(rows, row, config, places)
-            for column, row in ((0, 1), (0, 2), (2, 1))
-        ]
-    )
+    axes = ((0, 1), (0, 2), (2, 1))
+    return torch.cat([_wave(columns, c, config) + _wave(rows, r, config) for c, r in axes])
 
 
 def grow_model(earlier: OpenLRM, config: LRMConfig) -> OpenLRM:
@@ -128,17 +117,11 @@ def grow_model(earlier: OpenLRM, config: LRMConfig) -> OpenLRM:
         before, now = getattr(earlier.config, each.name), getattr(config, each.name)
         if each.name != "low_resolution" and before != now:
             raise ValueError(f"its {each.name} is {before}, and {now} here")
-    model, places = OpenLRM(config), _places(config)
-    old = earlier.config.low_resolution
-    learned = earlier.position[0] - 0.5 * _plane_places(earlier.config, places)
+    model, old = OpenLRM(config), earlier.config.low_resolution
+    learned = earlier.position[0] - 0.5 * _plane_places(earlier.config)
     planes = learned.unflatten(0, (3, old, old)).permute(0, 3, 1, 2)
     size = (config.low_resolution, config.low_resolution)
-    wider = (
-        F.interpolate(planes, size=size, mode="bilinear").flatten(2).transpose(1, 2).flatten(0, 1)
-    )
-    state = {
-        **earlier.state_dict(),
-        "position": (wider + 0.5 * _plane_places(config, places))[None],
-    }
-    model.load_state_dict(state)
+    wider = F.interpolate(planes, size=size, mode="bilinear").flatten(2).mT.flatten(0, 1)
+    position = (wider + 0.5 * _plane_places(config))[None]
+    model.load_state_dict({**earlier.state_dict(), "position": position})
     return model

@@ -78,6 +78,13 @@ def ray_samples(
     return distances, lengths
 
 
+def line_box(origins: Tensor, directions: Tensor, half_side: float) -> tuple[Tensor, Tensor]:
+    """Near and far of lines in the box, near above far for a miss. [..., 3] -> [...], [...]"""
+    inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
+    middle, reach = -origins * inverse, half_side * inverse.abs()
+    return (middle - reach).amax(dim=-1), (middle + reach).amin(dim=-1)
+
+
 def composite(density: Tensor, colours: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
     """Colours on white and opacity of rays. [..., S], [..., S, 3], [..., S] -> [..., 3], [...]"""
     depth = density * lengths

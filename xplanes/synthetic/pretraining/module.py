@@ -33,10 +33,6 @@ PATIENCE = 20
 """Consecutive steps with a non-finite loss after which training stops."""
 
 
-class PretrainingError(ConfigError):
-    """Pretraining cannot continue; the message names the problem and the settings to change."""
-
-
 class PretrainingModule(LightningModule):
     """Trains a model on procedural objects with known occupancy and colour.
 
@@ -102,7 +98,10 @@ class PretrainingModule(LightningModule):
     def training_step(self, batch: PretrainingBatch, batch_idx: int) -> None:
         optimizers = self.optimizers()
         assert isinstance(optimizers, list)
-        self._set_learning_rates()
+        peaks = self.schedule.muon_lr, self.schedule.adam_lr
+        for optimizer, peak in zip(optimizers, peaks, strict=True):
+            for group in optimizer.param_groups:
+                group["lr"] = self.rate * peak
         loss, parts = self.losses(batch)
         self.manual_backward(loss)
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.schedule.clip)
@@ -112,8 +111,15 @@ class PretrainingModule(LightningModule):
                 optimizer.step()
             optimizer.zero_grad()
         if not usable:
-            self._refuse(float(loss.detach()), float(norm))
-            return
+            self.unusable += 1
+            if self.unusable < PATIENCE:
+                return
+            raise ConfigError(
+                f"the loss was {float(loss.detach())} and its gradient's norm {float(norm)} for "
+                f"{PATIENCE} steps in a row, at step {self.steps}: lower schedule.muon_lr="
+                f"{self.schedule.muon_lr} and schedule.adam_lr={self.schedule.adam_lr}, and begin "
+                "again"
+            )
         self.unusable = 0
         self.steps += 1
         keep = min(self.schedule.average, (1 + self.steps) / (10 + self.steps))
@@ -145,13 +151,8 @@ class PretrainingModule(LightningModule):
         shape = (*batch.ray_hits.shape, self.batch.samples)
         random = step_generator(self.seed, self.steps, Stream.PRETRAINING, planes.device)
         jitter = torch.rand(shape, generator=random, device=planes.device)
-        distances, lengths = ray_samples(
-            batch.origins,
-            batch.directions,
-            batch.ray_hits,
-            half_side=self.model.half_side,
-            jitter=jitter,
-        )
+        rays = (batch.origins, batch.directions, batch.ray_hits)
+        distances, lengths = ray_samples(*rays, half_side=self.model.half_side, jitter=jitter)
         points = batch.origins[:, :, None] + distances[..., None] * batch.directions[:, :, None]
         with torch.autocast(planes.device.type, torch.bfloat16, enabled=self.bf16):
             logits = triplane_logits(planes, self.model.decoder, points.flatten(1, 2))
@@ -165,30 +166,12 @@ class PretrainingModule(LightningModule):
         left = (1 - self.progress) / max(self.schedule.decay_share, 1e-9)
         return warm * min(1.0, left)
 
-    def _set_learning_rates(self) -> None:
-        optimizers = self.optimizers()
-        assert isinstance(optimizers, list)
-        for optimizer, peak in zip(
-            optimizers, (self.schedule.muon_lr, self.schedule.adam_lr), strict=True
-        ):
-            for group in optimizer.param_groups:
-                group["lr"] = self.rate * peak
-
-    def _refuse(self, loss: float, norm: float) -> None:
-        self.unusable += 1
-        if self.unusable >= PATIENCE:
-            raise PretrainingError(
-                f"the loss was {loss} and its gradient's norm {norm} for {PATIENCE} steps in a "
-                f"row, at step {self.steps}: lower schedule.muon_lr={self.schedule.muon_lr} and "
-                f"schedule.adam_lr={self.schedule.adam_lr}, and begin again"
-            )
-
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["progress"] = {"steps": self.steps, "clock": self.clock}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        self.steps = checkpoint["progress"]["steps"]
-        self.clock = checkpoint["progress"]["clock"]
+        progress = checkpoint["progress"]
+        self.steps, self.clock = progress["steps"], progress["clock"]
 
 
 LONGEST = 10.0

@@ -218,9 +218,8 @@ def figure(b: Builder, frame: Array) -> None:
     size = (b.uniform(0.12, 0.17), b.uniform(0.12, 0.17), b.uniform(0.14, 0.2))
     b.add(head, ELLIPSOID if b.chance(0.8) else BOX, size, b.plain())
     if b.chance(0.6):
-        b.add(
-            head @ place((-0.02, 0, 0.05)), ELLIPSOID, tuple(1.06 * s for s in size), b.pattern(0.1)
-        )
+        hair = tuple(1.06 * s for s in size)
+        b.add(head @ place((-0.02, 0, 0.05)), ELLIPSOID, hair, b.pattern(0.1))
     if b.chance(0.5):
         b.add(neck, TORUS, (0.09, 0.04), b.pattern(0.1))
     if b.chance(0.4):
@@ -267,9 +266,8 @@ def tower(b: Builder, frame: Array) -> None:
     top = frame @ place((0, 0, level), (0, 0, b.uniform(0, 360)))
     b.add(top, ELLIPSOID if b.chance(0.6) else BOX, (1.1 * radius, radius, radius), b.pattern(0.2))
     if b.chance(0.5):
-        hub = top @ place(
-            (1.2 * radius, 0, 0.3 * radius), (b.uniform(0, 360), b.uniform(-15, 5), 0)
-        )
+        turn = (b.uniform(0, 360), b.uniform(-15, 5), 0.0)
+        hub = top @ place((1.2 * radius, 0, 0.3 * radius), turn)
         b.add(hub, ELLIPSOID, (0.07, 0.06, 0.06), b.plain())
         spar, cloth = b.plain(), b.pattern(0.2, 0.3)
         blades, reach, broad = b.count(2, 6), b.uniform(0.25, 0.5), b.uniform(0.03, 0.1)
@@ -310,12 +308,8 @@ def furniture(b: Builder, frame: Array) -> None:
                 b.add(at, CYLINDER, (thick, 0.5 * high), wood)
             else:
                 b.add(at, BOX, (thick, thick, 0.5 * high), wood)
-    b.add(
-        frame @ place((0, 0, high)),
-        BOX,
-        (wide, deep, 0.04),
-        wood if b.chance(0.5) else b.pattern(0.3),
-    )
+    board = wood if b.chance(0.5) else b.pattern(0.3)
+    b.add(frame @ place((0, 0, high)), BOX, (wide, deep, 0.04), board)
     if b.chance(0.5):
         back = b.uniform(0.2, 0.5)
         b.add(frame @ place((-0.9 * wide, 0, high + back)), BOX, (0.04, deep, back), b.pattern(0.3))
@@ -328,9 +322,8 @@ def furniture(b: Builder, frame: Array) -> None:
 def plant(b: Builder, frame: Array) -> None:
     """A tree, cactus or lamp: a stem with crowns and branches."""
     high = b.uniform(0.3, 0.9)
-    stem = limb(
-        b, frame @ place(turn=(180, 0, 0)), b.count(1, 3), 0.4 * high, b.uniform(0.03, 0.1), 12
-    )
+    root = frame @ place(turn=(180, 0, 0))
+    stem = limb(b, root, b.count(1, 3), 0.4 * high, b.uniform(0.03, 0.1), 12)
     crown = b.pattern(0.3)
     for _ in range(b.count(1, 4)):
         spot = tuple(float(v) for v in b.random.normal(0, 0.12, 3))
@@ -418,9 +411,8 @@ def _prop(b: Builder, reach: float) -> None:
         heap(b, place(spot, scale=b.uniform(0.1, 0.35)))
     else:
         size = (b.uniform(0.03, 0.3), b.uniform(0.03, 0.3), b.uniform(0.03, 0.3))
-        b.add(
-            place((spot[0], spot[1], size[2]), (0, 0, b.uniform(0, 90))), BOX, size, b.pattern(0.2)
-        )
+        at = place((spot[0], spot[1], size[2]), (0, 0, b.uniform(0, 90)))
+        b.add(at, BOX, size, b.pattern(0.2))
 
 
 def _light(b: Builder) -> Array:

@@ -20,7 +20,9 @@ from xplanes.files import read_json, replacing, write_json
 from xplanes.lrm.canonical import CanonicalView
 from xplanes.streams import Stream, step_generator
 from xplanes.synthetic.demo.render import CAMERA_ANGLE_X, CAMERA_DISTANCE, camera_at
+from xplanes.synthetic.pretraining.losses import line_box
 from xplanes.synthetic.pretraining.objects import procedural_object
+from xplanes.synthetic.pretraining.settings import BatchSettings
 from xplanes.synthetic.pretraining.solids import Array, Solids
 
 CPU = torch.device("cpu")
@@ -357,52 +359,36 @@ class PretrainingBatches:
     Args:
         pool: The objects.
         view: The model's camera.
+        counts: Numbers of objects, points and rays; half of the rays are from the input view.
         seed: Seed of all random choices.
-        objects: Objects per batch.
-        near: Points near the surface, per object.
-        volume: Points in the volume around the object, per object.
-        free: Points in the free space in front of the visible surface, per object.
-        colour: Surface points with colour supervision, per object.
-        rays: Rays per object, half of them from the input view; 0 for none.
     """
 
     def __init__(
-        self,
-        pool: Pool,
-        view: CanonicalView,
-        *,
-        seed: int,
-        objects: int,
-        near: int,
-        volume: int,
-        free: int,
-        colour: int,
-        rays: int,
+        self, pool: Pool, view: CanonicalView, counts: BatchSettings, *, seed: int
     ) -> None:
-        self.pool, self.view, self.seed, self.objects = pool, view, seed, objects
-        self.near, self.volume, self.free = near, volume, free
-        self.colour, self.rays = colour, rays
+        self.pool, self.view, self.counts, self.seed = pool, view, counts, seed
         self.side = pool.shards[0]["pictures"].shape[2]
         self.scale = view.distance / CAMERA_DISTANCE
 
     def draw(self, step: int) -> PretrainingBatch:
         """The batch of a step; each epoch uses every object at most once."""
-        device, side, count = self.pool.device, self.side, self.objects
+        device, side, counts = self.pool.device, self.side, self.counts
+        count = counts.objects
         random = step_generator(self.seed, step, Stream.PRETRAINING_BATCHES, device)
         record = self.pool.records(self._objects(step))
         views = record["poses"].shape[1]
         source = torch.randint(views, (count,), generator=random, device=device)
         each = torch.arange(count, device=device)
         turn = self._turn(record["poses"][each, source])
-        volume = torch.randint(VOLUME, (count, self.volume), generator=random, device=device)
+        volume = torch.randint(VOLUME, (count, counts.volume), generator=random, device=device)
         chosen = torch.cat([self._near(record, random), SURFACE + volume], dim=1)
         points = _take(record["points"], chosen).float() @ turn.mT
         free = self._free_points(record, source, turn, random)
         inside = torch.cat([record["inside"].gather(1, chosen), torch.zeros_like(free[..., 0])], 1)
-        at = torch.randint(SURFACE, (count, self.colour), generator=random, device=device)
-        shift = torch.randn(count, self.colour, 3, generator=random, device=device)
+        at = torch.randint(SURFACE, (count, counts.colour), generator=random, device=device)
+        shift = torch.randn(count, counts.colour, 3, generator=random, device=device)
         surface = _take(record["surface"], at).float() + DITHER * shift
-        origins, directions, pixels, hits = self._rays(record, source, turn, random, self.rays)
+        origins, directions, pixels, hits = self._rays(record, source, turn, random, counts.rays)
         image = record["pictures"][each, source, ..., :3].permute(0, 3, 1, 2)
         # Augmentation: mirroring and permuting the colour channels.
         mirror = torch.rand(count, 1, 1, 1, generator=random, device=device) < 0.5
@@ -430,21 +416,23 @@ class PretrainingBatches:
 
     def _objects(self, step: int) -> Tensor:
         """Indices of a step's objects. [B]"""
-        turns = len(self.pool) // self.objects
+        count = self.counts.objects
+        turns = len(self.pool) // count
         epoch = step_generator(self.seed, step // turns, Stream.PRETRAINING_ORDER)
-        start = step % turns * self.objects
-        return torch.randperm(len(self.pool), generator=epoch)[start : start + self.objects]
+        start = step % turns * count
+        return torch.randperm(len(self.pool), generator=epoch)[start : start + count]
 
     def _near(self, record: Records, random: torch.Generator) -> Tensor:
         """Indices of points near the surface: of `TRIES` candidates, the farthest from it. [B, N]
 
         Points much closer to the surface than one texel carry little information.
         """
-        shape = self.objects, self.near * TRIES
+        near = self.counts.near
+        shape = self.counts.objects, near * TRIES
         tries = torch.randint(SURFACE, shape, generator=random, device=self.pool.device)
         apart = _take(record["points"], tries).float() - _take(record["surface"], tries).float()
-        best = apart.square().sum(dim=-1).unflatten(1, (self.near, TRIES)).argmax(dim=2)
-        return tries.gather(1, TRIES * torch.arange(self.near, device=best.device) + best)
+        best = apart.square().sum(dim=-1).unflatten(1, (near, TRIES)).argmax(dim=2)
+        return tries.gather(1, TRIES * torch.arange(near, device=best.device) + best)
 
     def _turn(self, poses: Tensor) -> Tensor:
         """Rotation and scale from objects' world to the model's frame. [B, 4, 4] -> [B, 3, 3]"""
@@ -487,13 +475,10 @@ class PretrainingBatches:
         self, record: Records, source: Tensor, turn: Tensor, random: torch.Generator
     ) -> Tensor:
         """Points between the near bound of the box and the first hit of a ray. [B, F, 3]"""
-        origins, directions, _, hits = self._rays(
-            record, source, turn, random, self.free, middle=False
-        )
-        inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
-        reach = self.view.half_side * inverse.abs()
-        near = (-origins * inverse - reach).amax(dim=-1)
-        far = torch.minimum((-origins * inverse + reach).amin(dim=-1), hits - 0.01)
+        count = self.counts.free
+        origins, directions, _, hits = self._rays(record, source, turn, random, count, middle=False)
+        near, far = line_box(origins, directions, self.view.half_side)
+        far = torch.minimum(far, hits - 0.01)
         share = torch.rand(near.shape, generator=random, device=self.pool.device)
         distance = near + share * (far - near).clamp_min(0)
         return origins + distance[..., None] * directions

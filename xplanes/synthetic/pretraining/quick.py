@@ -9,7 +9,7 @@ from xplanes.lrm.openlrm import OpenLRM
 from xplanes.metrics import psnr
 from xplanes.synthetic.demo.render import CAMERA_DISTANCE
 from xplanes.synthetic.pretraining.losses import triplane_logits
-from xplanes.synthetic.pretraining.pool import FOCAL, Pool
+from xplanes.synthetic.pretraining.pool import Pool
 from xplanes.synthetic.pretraining.render import render_view
 
 
@@ -40,9 +40,7 @@ class QuickLook:
             found["iou"].append(overlap(solid, record["inside"] > 0))
             for name, view in (("psnr_input", 0), ("psnr_novel", 1)):
                 pose = model_pose(record["poses"][view], turn)
-                rendered = render_view(
-                    planes, model.decoder, pose, side=pictures.shape[1], focal=FOCAL
-                )
+                rendered = render_view(planes, model.decoder, pose, pictures.shape[1])
                 found[name].append(psnr(rendered, pictures[view]))
         return {name: sum(values) / len(values) for name, values in found.items()}
 

@@ -5,7 +5,11 @@ from torch import Tensor
 
 from xplanes.fields.decoder import Decoder
 from xplanes.scenes.cameras import cast_rays
-from xplanes.synthetic.pretraining.losses import composite, triplane_logits
+from xplanes.synthetic.pretraining.losses import composite, line_box, triplane_logits
+from xplanes.synthetic.pretraining.pool import FOCAL
+
+SAMPLES = 96
+"""Samples per ray."""
 
 CHUNK = 2**14
 """Samples decoded at once, so that temporaries fit in the cache."""
@@ -15,11 +19,7 @@ def render_view(
     planes: Tensor,
     decoder: Decoder,
     pose: Tensor,
-    *,
     side: int,
-    focal: float,
-    half_side: float = 1.0,
-    samples: int = 96,
 ) -> Tensor:
     """Render one triplane on a white background.
 
@@ -28,9 +28,6 @@ def render_view(
         decoder: Maps features to logits.
         pose: Camera-to-world matrix in the model's frame. [4, 4]
         side: Height and width in pixels.
-        focal: Focal length as a share of the image side.
-        half_side: Half the side of the box.
-        samples: Samples per ray.
 
     Returns:
         RGB from 0 to 1. [S, S, 3]
@@ -38,23 +35,21 @@ def render_view(
     line, middle = torch.arange(side, device=pose.device), (0.5 * side, 0.5 * side)
     rows, columns = torch.meshgrid(line, line, indexing="ij")
     origins, directions = cast_rays(
-        pose, rows.flatten(), columns.flatten(), focal=focal * side, centre=middle
+        pose, rows.flatten(), columns.flatten(), focal=FOCAL * side, centre=middle
     )
-    inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
-    middle, reach = -origins * inverse, half_side * inverse.abs()
-    near, far = (middle - reach).amax(-1), (middle + reach).amin(-1)
-    step = (far - near).clamp_min(0) / samples
+    near, far = line_box(origins, directions, 1.0)
+    step = (far - near).clamp_min(0) / SAMPLES
     picture = torch.ones(side * side, 3, device=pose.device)
-    along = torch.arange(samples, device=pose.device) + 0.5
+    along = torch.arange(SAMPLES, device=pose.device) + 0.5
     rays = (step > 0).nonzero()[:, 0]
-    for chosen in rays.split(max(1, CHUNK // samples)):
+    for chosen in rays.split(max(1, CHUNK // SAMPLES)):
         distances = near[chosen, None] + step[chosen, None] * along
         points = origins[chosen, None] + distances[..., None] * directions[chosen, None]
         logits = triplane_logits(planes, decoder, points.flatten(0, 1)[None])[0]
         colours, density = decoder.activate(logits)
         picture[chosen] = composite(
-            density.unflatten(0, (len(chosen), samples)),
-            colours.unflatten(0, (len(chosen), samples)),
-            step[chosen, None].expand(-1, samples),
+            density.unflatten(0, (len(chosen), SAMPLES)),
+            colours.unflatten(0, (len(chosen), SAMPLES)),
+            step[chosen, None].expand(-1, SAMPLES),
         )[0]
     return picture.clamp(0, 1).unflatten(0, (side, side))

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
 from xplanes.backend import fast_bf16
+from xplanes.components import read_settings
 from xplanes.config import compose_plain
 from xplanes.errors import ConfigError
 from xplanes.files import read_json, replacing, write_json
@@ -31,16 +32,13 @@ from xplanes.synthetic.pretraining.objects import HELD_OUT_SEEDS, TRAINING_SEEDS
 from xplanes.synthetic.pretraining.pool import (
     FOCAL,
     SHARD,
+    Pool,
     PretrainingBatch,
     PretrainingBatches,
     ensure_pool,
 )
 from xplanes.synthetic.pretraining.quick import QuickLook
-from xplanes.synthetic.pretraining.settings import (
-    PretrainingSettings,
-    parse_pretraining,
-    published_sizes,
-)
+from xplanes.synthetic.pretraining.settings import PretrainingSettings, published_sizes
 from xplanes.training.checkpoints import load_checkpoint
 from xplanes.training.clock import Interrupt
 from xplanes.training.fit import quiet_lightning
@@ -111,29 +109,33 @@ class Steps(IterableDataset):
             yield self.batches.draw(step)
 
 
-def pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str], None]) -> Path:
-    """Train a model until its budget is used, resuming from its last checkpoint if there is one.
+def run_pretraining(overrides: Sequence[str], announce: Callable[[str], None]) -> Path:
+    """Train a small LRM until its budget is used, from its last checkpoint on if there is one.
 
     Args:
-        plain: The configuration as builtins, written to the run folder.
-        config: The same configuration as typed settings.
+        overrides: Settings of conf/pretrain_lrm.yaml, as ``key=value``.
         announce: Receives progress messages.
 
     Returns:
         The file of the weights; the configuration is in the same folder.
 
     Raises:
-        ConfigError: If the run folder holds a run with another model, pool or seed.
+        ConfigError: If a setting is invalid, or the run folder holds a run with another model, pool
+            or seed.
     """
-    quiet_lightning()
-    with alone_in(Path(config.run)):
-        return _pretrain(plain, config, announce)
-
-
-def _pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str], None]) -> Path:
+    plain = compose_plain("pretrain_lrm", overrides)
+    config = read_settings(PretrainingSettings, plain)
     run = Path(config.run)
+    quiet_lightning()
+    with alone_in(run):
+        _settle(run, plain)
+        average = _trained(run, config, announce)
+        return export(average, published_sizes(config.model, FOCAL), run, config.model.name)
+
+
+def _trained(run: Path, config: PretrainingSettings, announce: Callable[[str], None]) -> OpenLRM:
+    """The moving average of a trained model."""
     last = run / CHECKPOINT
-    _settle(run, plain)
     if last.is_file():
         try:
             load_checkpoint(last)
@@ -142,7 +144,7 @@ def _pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str]
                 f"{last} is damaged: delete it to start again, or name another run"
             ) from problem
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    module, data, look = assemble(config, device, announce)
+    module, data, look = _assemble(config, device, announce)
     if last.is_file():
         announce(f"resuming from {last}")
     interrupt = Interrupt()
@@ -163,51 +165,38 @@ def _pretrain(plain: dict, config: PretrainingSettings, announce: Callable[[str]
     checkpoint = str(last) if last.is_file() else None
     with interrupt.exits():
         trainer.fit(module, loader, ckpt_path=checkpoint, weights_only=True)
-    return export(module.average, published_sizes(config.model, FOCAL), run, config.model.name)
+    return module.average
 
 
-def assemble(
+def _assemble(
     config: PretrainingSettings, device: torch.device, announce: Callable[[str], None]
 ) -> tuple[PretrainingModule, PretrainingBatches, QuickLook]:
     """The initialised module, its training batches, and the scores on held-out objects."""
-    pool, batch, side = config.pool, config.batch, config.model.image_size
-    drawn = ensure_pool(
-        Path(pool.root),
-        TRAINING_SEEDS[: pool.objects],
-        views=pool.views,
-        side=side,
-        device=device,
-        workers=os.cpu_count() or 1,
-        announce=announce,
-    )
-    shards = math.ceil(config.schedule.score_objects / SHARD)
-    held_out = ensure_pool(
-        Path(pool.root) / "held_out",
-        HELD_OUT_SEEDS[: shards * SHARD],
-        views=pool.views,
-        side=side,
-        device=device,
-        announce=announce,
-    )
+    root, schedule = Path(config.pool.root), config.schedule
+
+    def pool(folder: Path, seeds: range, workers: int) -> Pool:
+        return ensure_pool(
+            folder,
+            seeds,
+            views=config.pool.views,
+            side=config.model.image_size,
+            device=device,
+            workers=workers,
+            announce=announce,
+        )
+
+    drawn = pool(root, TRAINING_SEEDS[: config.pool.objects], os.cpu_count() or 1)
+    shards = math.ceil(schedule.score_objects / SHARD)
+    held_out = pool(root / "held_out", HELD_OUT_SEEDS[: shards * SHARD], 1)
     sizes = parse_config(published_sizes(config.model, FOCAL))
     model = (
         init_model(sizes, config.seed)
         if config.init_from is None
         else _grown(config.init_from, sizes)
     )
-    module = PretrainingModule(model, batch, config.schedule, config.seed, bf16=fast_bf16(device))
-    data = PretrainingBatches(
-        drawn,
-        model.view,
-        seed=config.seed,
-        objects=batch.objects,
-        near=batch.near,
-        volume=batch.volume,
-        free=batch.free,
-        colour=batch.colour,
-        rays=batch.rays,
-    )
-    return module, data, QuickLook(held_out, config.schedule.score_objects)
+    module = PretrainingModule(model, config.batch, schedule, config.seed, bf16=fast_bf16(device))
+    data = PretrainingBatches(drawn, model.view, config.batch, seed=config.seed)
+    return module, data, QuickLook(held_out, schedule.score_objects)
 
 
 def _grown(init_from: str, sizes: LRMConfig) -> OpenLRM:
@@ -241,25 +230,3 @@ def _settle(run: Path, plain: dict) -> None:
                     f"name another folder, or keep {key} as it was"
                 )
     write_json(path, plain)
-
-
-def compose_pretraining(overrides: Sequence[str]) -> dict:
-    """The resolved configuration as builtins.
-
-    Raises:
-        ConfigError: For a key or option that does not exist.
-    """
-    return compose_plain("pretrain_lrm", overrides)
-
-
-def run_pretraining(overrides: Sequence[str], announce: Callable[[str], None]) -> Path:
-    """Train a small LRM; returns the file of its weights.
-
-    Raises:
-        ConfigError: If a setting is invalid.
-    """
-    plain = compose_pretraining(overrides)
-    config = parse_pretraining(plain)
-    from xplanes.synthetic.pretraining.run import pretrain
-
-    return pretrain(plain, config, announce)

@@ -16,7 +16,7 @@ from xplanes.synthetic.demo.render import camera_at, render_image
 from xplanes.synthetic.demo.scenes import DEMO_SCENES, build_demo_scene
 from xplanes.synthetic.pretraining.losses import triplane_logits
 from xplanes.synthetic.pretraining.objects import HELD_OUT_SEEDS, procedural_object
-from xplanes.synthetic.pretraining.pool import FOCAL, inside, render_solids, view_cameras
+from xplanes.synthetic.pretraining.pool import inside, render_solids, view_cameras
 from xplanes.synthetic.pretraining.quick import model_pose, overlap, world_to_model
 from xplanes.synthetic.pretraining.render import render_view
 
@@ -115,8 +115,7 @@ def score(model: LRM, subject: Subject) -> Score:
     )
     world = grid @ torch.linalg.inv(turn).T
     rendered = [
-        render_view(planes, model.decoder, model_pose(pose, turn), side=side, focal=FOCAL)
-        for pose in subject.cameras
+        render_view(planes, model.decoder, model_pose(pose, turn), side) for pose in subject.cameras
     ]
     quality = [(psnr(a, b), ssim(a, b)) for a, b in zip(rendered, pictures, strict=True)]
     novel = quality[1:]
@@ -156,15 +155,18 @@ def score_all(
         folder / "scores.json", {"mean": table, "objects": {s.name: s.values for s in found}}
     )
     by_overlap = sorted(found, key=lambda s: s.values["iou"])
-    write_sheet(folder / "objects.png", [s.strip for s in found[:16]], 2)
-    write_sheet(folder / "demo.png", [s.strip for s in scenes], 2)
-    write_sheet(folder / "failures.png", [s.strip for s in by_overlap[:6]], 2)
+    for name, shown in (
+        ("objects", found[:16]),
+        ("demo", scenes),
+        ("failures", by_overlap[:6]),
+    ):
+        _write_sheet(folder / f"{name}.png", [s.strip for s in shown])
     return table
 
 
-def write_sheet(path: Path, strips: list[Tensor], columns: int) -> None:
-    """Write strips of images as a PNG sheet."""
-    rows = [torch.cat(strips[i : i + columns], dim=1) for i in range(0, len(strips), columns)]
+def _write_sheet(path: Path, strips: list[Tensor]) -> None:
+    """Write strips of images as a PNG sheet of two columns."""
+    rows = [torch.cat(strips[i : i + 2], dim=1) for i in range(0, len(strips), 2)]
     width = max(row.shape[1] for row in rows)
     filled = [torch.nn.functional.pad(r, (0, 0, 0, width - r.shape[1]), value=1.0) for r in rows]
     pixels = (torch.cat(filled).clamp(0, 1) * 255).round().to(torch.uint8).numpy()

@@ -1,10 +1,8 @@
 """Typed settings of `xplanes pretrain-lrm`. Their values are in conf/."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from xplanes.components import read_settings
 from xplanes.errors import ConfigError
 from xplanes.settings import Count, Location, Positive, Settings, Share, Steps, Weight
 
@@ -117,15 +115,6 @@ class PretrainingSettings(Settings):
                 f"batch.objects={self.batch.objects}: must not be above pool.objects="
                 f"{self.pool.objects}"
             )
-
-
-def parse_pretraining(plain: Mapping[str, Any]) -> PretrainingSettings:
-    """A plain configuration as typed settings.
-
-    Raises:
-        ConfigError: If settings are out of range or contradict one another.
-    """
-    return read_settings(PretrainingSettings, plain)
 
 
 def published_sizes(model: SizeSettings, focal: float) -> dict[str, Any]:

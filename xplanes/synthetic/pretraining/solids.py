@@ -1,6 +1,6 @@
 """Lit solids as arrays for the compiled loops, and their conversion to the demo's classes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -94,13 +94,12 @@ class Solids:
     def moved(self, scale: float, shift: Array) -> "Solids":
         """All solids and patterns scaled about the origin, then translated."""
         numbers = self.numbers.copy()
-        for kind, columns in ((PLAIN, slice(1, 2)), (STRIPES, slice(1, 2)), (CHECKER, slice(3))):
-            numbers[self.patterns == kind, columns] *= scale
-        numbers[self.patterns == BRICKS, :3] *= scale
-        return Solids(
-            self.kinds, self.sizes * scale, self.rotations, self.centres * scale + shift,
-            self.patterns, self.paints, numbers, self.light,
-        )  # fmt: skip
+        for kind in (PLAIN, STRIPES):
+            numbers[self.patterns == kind, 1] *= scale
+        for kind in (CHECKER, BRICKS):
+            numbers[self.patterns == kind, :3] *= scale
+        sizes, centres = self.sizes * scale, self.centres * scale + shift
+        return replace(self, sizes=sizes, centres=centres, numbers=numbers)
 
     def posed(self) -> Posed:
         """The same solids as the demo's classes, in double precision: the reference."""
@@ -119,10 +118,8 @@ class Solids:
 
 
 def _primitive(kind: int, size: list[float]) -> Primitive:
-    if kind == BOX:
-        return Box((size[0], size[1], size[2]))
-    if kind == ELLIPSOID:
-        return Ellipsoid((size[0], size[1], size[2]))
+    if kind in (BOX, ELLIPSOID):
+        return (Box if kind == BOX else Ellipsoid)((size[0], size[1], size[2]))
     return {CYLINDER: Cylinder, CAPSULE: Capsule, TORUS: Torus}[kind](size[0], size[1])
 
 

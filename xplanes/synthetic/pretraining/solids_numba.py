@@ -137,6 +137,25 @@ def normal(kind, a, b, c, x, y, z):
 
 
 @njit(exact=True, forceinline=True)
+def turned(r, x, y, z):
+    """A vector in the coordinates of a part with this rotation."""
+    return (
+        x * r[0, 0] + y * r[1, 0] + z * r[2, 0],
+        x * r[0, 1] + y * r[1, 1] + z * r[2, 1],
+        x * r[0, 2] + y * r[1, 2] + z * r[2, 2],
+    )
+
+
+@njit(exact=True, forceinline=True)
+def toned(paint, tone):
+    return (
+        min(max(paint[0] * tone, 0.0), 1.0),
+        min(max(paint[1] * tone, 0.0), 1.0),
+        min(max(paint[2] * tone, 0.0), 1.0),
+    )
+
+
+@njit(exact=True, forceinline=True)
 def cell(value, width):
     return math.floor(value * (INWARD / width))
 
@@ -153,11 +172,7 @@ def paint(pattern, paints, n, x, y, z):
             waves = math.sin(u + 0.9 * math.sin(0.7 * v)) * math.cos(v + 0.9 * math.sin(0.6 * w))
             waves += 0.6 * math.sin(1.7 * w + 0.8 * u) * math.cos(1.3 * v - 0.5 * u)
             tone += n[0] * waves
-        return (
-            min(max(paints[0, 0] * tone, 0.0), 1.0),
-            min(max(paints[0, 1] * tone, 0.0), 1.0),
-            min(max(paints[0, 2] * tone, 0.0), 1.0),
-        )
+        return toned(paints[0], tone)
     if pattern == 1:
         value = x if n[0] == 0 else (y if n[0] == 1 else z)
         index = int(cell(value, n[1]) % n[2])
@@ -174,12 +189,7 @@ def paint(pattern, paints, n, x, y, z):
         if (along - column) * n[0] < n[2] or z - row * n[1] < n[2]:
             return paints[1, 0], paints[1, 1], paints[1, 2]
         noise = math.sin(row * 12.9898 + column * 78.233) * 437.585
-        tone = 1 + 0.2 * (noise - math.trunc(noise))
-        return (
-            min(max(paints[0, 0] * tone, 0.0), 1.0),
-            min(max(paints[0, 1] * tone, 0.0), 1.0),
-            min(max(paints[0, 2] * tone, 0.0), 1.0),
-        )
+        return toned(paints[0], 1 + 0.2 * (noise - math.trunc(noise)))
     return paints[index, 0], paints[index, 1], paints[index, 2]
 
 
@@ -196,16 +206,9 @@ def first(parts, ox, oy, oz, dx, dy, dz, any_hit):
             continue
         if cx * cx + cy * cy + cz * cz - along * along > radius * radius * 1.0001 + 1e-9:
             continue
-        r = rotations[p]
-        t = hit(
-            kinds[p], sizes[p, 0], sizes[p, 1], sizes[p, 2],
-            cx * r[0, 0] + cy * r[1, 0] + cz * r[2, 0],
-            cx * r[0, 1] + cy * r[1, 1] + cz * r[2, 1],
-            cx * r[0, 2] + cy * r[1, 2] + cz * r[2, 2],
-            dx * r[0, 0] + dy * r[1, 0] + dz * r[2, 0],
-            dx * r[0, 1] + dy * r[1, 1] + dz * r[2, 1],
-            dx * r[0, 2] + dy * r[1, 2] + dz * r[2, 2],
-        )  # fmt: skip
+        x, y, z = turned(rotations[p], cx, cy, cz)
+        u, v, w = turned(rotations[p], dx, dy, dz)
+        t = hit(kinds[p], sizes[p, 0], sizes[p, 1], sizes[p, 2], x, y, z, u, v, w)
         if t < best:
             best, found = t, p
             if any_hit:
@@ -218,18 +221,14 @@ def shade(parts, p, x, y, z, result):
     """Normal (0 to 2) and shaded colour (3 to 5) of part p at a point on its surface."""
     kinds, sizes, rotations, centres, _, patterns, paints, numbers, light = parts
     r = rotations[p]
-    lx, ly, lz = x - centres[p, 0], y - centres[p, 1], z - centres[p, 2]
-    u = lx * r[0, 0] + ly * r[1, 0] + lz * r[2, 0]
-    v = lx * r[0, 1] + ly * r[1, 1] + lz * r[2, 1]
-    w = lx * r[0, 2] + ly * r[1, 2] + lz * r[2, 2]
+    u, v, w = turned(r, x - centres[p, 0], y - centres[p, 1], z - centres[p, 2])
     a, b, c = normal(kinds[p], sizes[p, 0], sizes[p, 1], sizes[p, 2], u, v, w)
     nx = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c
     ny = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c
     nz = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
     red, green, blue = paint(patterns[p], paints[p], numbers[p], u, v, w)
-    sx, sy, sz = light[0], light[1], light[2]
-    length = math.sqrt(sx * sx + sy * sy + sz * sz)
-    sx, sy, sz = sx / length, sy / length, sz / length
+    length = math.sqrt(light[0] * light[0] + light[1] * light[1] + light[2] * light[2])
+    sx, sy, sz = light[0] / length, light[1] / length, light[2] / length
     facing = max(nx * sx + ny * sy + nz * sz, 0.0) * light[3]
     if facing > 0 and light[6] > 0:
         away = 1e-3
@@ -260,14 +259,11 @@ def inside(parts, points, result):
     kinds, sizes, rotations, centres, reach = parts[:5]
     for i in range(len(points)):
         for p in range(len(kinds)):
-            x, y, z = points[i, 0] - centres[p, 0], points[i, 1] - centres[p, 1], points[i, 2]
-            z -= centres[p, 2]
+            x, y = points[i, 0] - centres[p, 0], points[i, 1] - centres[p, 1]
+            z = points[i, 2] - centres[p, 2]
             if x * x + y * y + z * z > reach[p] * reach[p]:
                 continue
-            r = rotations[p]
-            u = x * r[0, 0] + y * r[1, 0] + z * r[2, 0]
-            v = x * r[0, 1] + y * r[1, 1] + z * r[2, 1]
-            w = x * r[0, 2] + y * r[1, 2] + z * r[2, 2]
+            u, v, w = turned(rotations[p], x, y, z)
             if distance(kinds[p], sizes[p, 0], sizes[p, 1], sizes[p, 2], u, v, w) < 0:
                 result[i] = True
                 break
@@ -283,12 +279,9 @@ def render(parts, rectangles, pose, focal, samples, colour, alpha, depth):
     for p in range(len(kinds)):
         r = rotations[p]
         x, y, z = pose[0, 3] - centres[p, 0], pose[1, 3] - centres[p, 1], pose[2, 3] - centres[p, 2]
-        ox = x * r[0, 0] + y * r[1, 0] + z * r[2, 0]
-        oy = x * r[0, 1] + y * r[1, 1] + z * r[2, 1]
-        oz = x * r[0, 2] + y * r[1, 2] + z * r[2, 2]
-        for i in range(3):
-            for j in range(3):
-                turn[i, j] = r[0, i] * pose[0, j] + r[1, i] * pose[1, j] + r[2, i] * pose[2, j]
+        ox, oy, oz = turned(r, x, y, z)
+        for j in range(3):
+            turn[0, j], turn[1, j], turn[2, j] = turned(r, pose[0, j], pose[1, j], pose[2, j])
         a, b, c = sizes[p, 0], sizes[p, 1], sizes[p, 2]
         for i in range(rectangles[p, 0], rectangles[p, 1]):
             up = (0.5 - (i + 0.5) / side) / focal

@@ -144,8 +144,7 @@ def dark(variation: Variation) -> Assembly:
     parts = [
         Part(Box((0.92, 0.66, 0.06)), black, position=(0, 0, -0.62)),
         Part(Box((0.86, 0.6, 0.03)), coal, position=(0, 0, -0.54)),
-        Part(Box((0.07, 0.1, 0.36)), grey, position=(-0.28, 0.06, -0.22)),
-        Part(Box((0.07, 0.1, 0.36)), grey, position=(0.42, 0.06, -0.22)),
+        *(Part(Box((0.07, 0.1, 0.36)), grey, position=(x, 0.06, -0.22)) for x in (-0.28, 0.42)),
     ]
     for name, radius, teeth, surface in (("large", 0.4, 14, coal), ("small", 0.215, 8, steel)):
         parts += [

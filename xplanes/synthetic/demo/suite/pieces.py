@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 
-from xplanes.synthetic.demo.assembly import WORLD, Joint, Part, Vector
+from xplanes.synthetic.demo.assembly import WORLD, Joint, Kind, Part, Vector
 from xplanes.synthetic.demo.geometry import Capsule, Ellipsoid, Surface
 from xplanes.synthetic.demo.motions import Motion
 
@@ -44,22 +44,18 @@ def moving(
         size: Scale factor over time.
     """
     joints: list[Joint] = []
-
-    def add(suffix: str, **changes) -> None:
-        place = (position, rotation) if not joints else (ORIGIN, ORIGIN)
-        joints.append(Joint(f"{name} {suffix}", parent, *place, **changes))
-
-    for key, motion in (("x", x), ("y", y), ("z", z)):
+    place = position, rotation
+    steps: tuple[tuple[str, Kind, Vector, Motion | None], ...] = (
+        ("x", "slide", AXES["x"], x),
+        ("y", "slide", AXES["y"], y),
+        ("z", "slide", AXES["z"], z),
+        ("turn", "hinge", axis, turn),
+        ("size", "scale", AXES["z"], size),
+    )
+    for suffix, kind, along, motion in steps:
         if motion is not None:
-            add(key, kind="slide", axis=AXES[key], motion=motion)
-            parent = joints[-1].name
-    if turn is not None:
-        add("turn", kind="hinge", axis=axis, motion=turn)
-        parent = joints[-1].name
-    if size is not None:
-        add("size", kind="scale", motion=size)
-        parent = joints[-1].name
-    place = (position, rotation) if not joints else (ORIGIN, ORIGIN)
+            joints.append(Joint(f"{name} {suffix}", parent, *place, kind, along, motion))
+            parent, place = joints[-1].name, (ORIGIN, ORIGIN)
     return [*joints, Joint(name, parent, *place)]
 
 

@@ -279,7 +279,7 @@ def test_the_estimate_counts_every_image_as_the_field_is_when_it_is_drawn(scenes
     data.setup("fit")
     module = RadianceModule(experiment.method)
     module.build(data.scene)
-    expected = Estimate(step=0.5, first_ray=5.0, later_ray=1.0, pruned_at=1000)
+    expected = Estimate(0.5, first_ray=5.0, later_ray=1.0, pruned_at=1000, early=0.25, passing=0.0)
     assert [expected.ray(step) for step in (0, 85, 170, 999, 1000)] == [5, 3, 2, 2, 1]
     assert expected._replace(passing=0.5).ray(1000) == 3
     validated, tested, video = 2 * 32**2, 3 * 32**2, FRAMES * 64**2

@@ -239,19 +239,21 @@ class Estimate(NamedTuple):
         first_ray: Seconds per ray of an image of the untrained field.
         later_ray: Seconds per ray once surfaces are opaque and empty space is pruned.
         pruned_at: First step at which empty space is pruned.
-        passing: Share of the extra time of an untrained field that remains after that step.
+        early: Least share of the extra time of an untrained field that remains until that step.
+        passing: Share of it that remains after that step.
     """
 
     step: float
     first_ray: float
     later_ray: float
     pruned_at: int
-    passing: float = 0.0
+    early: float
+    passing: float
 
     def ray(self, step: float) -> float:
         """Seconds per ray of an image after a number of steps."""
         pruned = step >= self.pruned_at
-        share = self.passing if pruned else max(0.5 ** (step / HALF_OPAQUE), PASSING)
+        share = self.passing if pruned else max(0.5 ** (step / HALF_OPAQUE), self.early)
         return self.later_ray + (self.first_ray - self.later_ray) * share
 
 
@@ -268,16 +270,18 @@ HALF_OPAQUE = 85
 Measured on a capture with surroundings, in which no cell is pruned in the first 800 steps.
 """
 
-PASSING = 0.25
-"""Assumed share of rays that meet no surface, and have samples until empty space is pruned.
+PASSING, PASSING_PRUNED = 0.25, 0.15
+"""Assumed shares of rays that meet no surface, and have samples: until empty space is pruned, and
+afterwards in scenes with surroundings.
 
-Measured: 0.47 on a capture in front of a black backdrop, 0 on one inside a room.
+Measured until then: 0.47 on a capture in front of a black backdrop, 0 on one inside a room;
+afterwards: 0.13 for a scene on a table, 0 inside the room.
 """
 
-PASSING_PRUNED = 0.15
-"""The same in scenes with surroundings once empty space is pruned.
+RIG_PASSING = 0.1
+"""Added to both in rigs.
 
-Measured: 0.41 in front of the backdrop, 0.13 for a scene on a table, 0 inside the room.
+Measured on five rigs, until then: 0.5; afterwards: from 0.15 inside a room to 0.4 in the open.
 """
 
 OPAQUE = 1000.0
@@ -314,10 +318,11 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
     taken = WHOLE_STEP * _seconds(step, device)
     if not isinstance(renderer, RayRenderer):
         ray = _seconds(lambda: renderer.view(field, frame, camera, *seen_at), device) / pixels
-        return Estimate(taken, ray, ray, 0)
+        return Estimate(taken, ray, ray, 0, 0.0, 0.0)
     chosen = torch.linspace(0, pixels - 1, min(renderer.rays_at_once, pixels)).long()
     origins, directions = (part[chosen].to(device) for part in frame.rays(*camera.rays()))
     first = later = _seconds(lambda: renderer.image(field, origins, directions, *seen_at), device)
+    more = RIG_PASSING if module.site.is_rig else 0.0
     passing = 0.0
     if pruned_at := module.sampler.pruned_at:
         solid = field.masked(lambda points: points.new_full(points.shape[:1], OPAQUE))
@@ -326,8 +331,9 @@ def estimate(module: RadianceModule, data: SceneDataModule) -> Estimate:
             with torch.no_grad():
                 seen = origins, directions
                 later += BEHIND * _seconds(lambda: background_colour(background, *seen), device)
-            passing = PASSING_PRUNED
-    return Estimate(taken, first / len(chosen), later / len(chosen), pruned_at, passing)
+            passing = PASSING_PRUNED + more
+    first, later = first / len(chosen), later / len(chosen)
+    return Estimate(taken, first, later, pruned_at, PASSING + more, passing)
 
 
 def _seconds(work: Callable[[], Any], device: torch.device) -> float:

@@ -125,7 +125,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "threshold as without surroundings": ("model.sampler.threshold_with_background=0.001",),
     "all pixels drawn alike": ("model.rays.skip_background=false",),
     "light may pass the cube": ("model.loss.passing=0",),
-    "no price on distortion": ("model.sampler.distortion=0",),
+    "no penalty on distortion": ("model.sampler.distortion=0",),
     "initialised from tiny": ("lrm=tiny",),
 }
 

@@ -34,7 +34,7 @@ OBJECTS = 64
 OTHER_SCENE = "walker"
 """The demo scene whose video is a control for other scenes."""
 
-NOT_HELD = ("model.loss.sparse_weight=0.0", "model.loss.initial_weight=0.0")
+NOT_REGULARISED = ("model.loss.sparse_weight=0.0", "model.loss.initial_weight=0.0")
 """Without the terms that hold the field near its initial values."""
 
 
@@ -47,7 +47,7 @@ def overrides(control: str, oracle: Path | None = None) -> list[str]:
     """
     given = ["lrm=tiny", "lrm._target_=controls.ControlSettings", f"+lrm.control={control}"]
     given.append(f"+lrm.triplanes={'null' if oracle is None else oracle}")
-    return given + (list(NOT_HELD) if control == "random_planes" else [])
+    return given + (list(NOT_REGULARISED) if control == "random_planes" else [])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,8 +23,8 @@ from xplanes.cli import main
 from xplanes.config import CONF, compose_plain, near_names
 from xplanes.errors import ConfigError, SceneError
 from xplanes.evaluation import report
+from xplanes.evaluation.estimate import Estimate, estimated
 from xplanes.evaluation.render import FRAMES
-from xplanes.evaluation.report import estimated
 from xplanes.experiment import Experiment
 from xplanes.launch import prepare
 from xplanes.run import prepare as prepare_run
@@ -32,7 +32,6 @@ from xplanes.run import run
 from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.training import bar
 from xplanes.training.evaluation import forget_later
-from xplanes.training.fit import Estimate
 from xplanes.training.module import RadianceModule
 
 

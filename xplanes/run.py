@@ -16,6 +16,7 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from xplanes.backend import warm_up
 from xplanes.errors import XPlanesError
+from xplanes.evaluation.estimate import estimate
 from xplanes.evaluation.findings import scene_findings
 from xplanes.evaluation.render import write_run_video
 from xplanes.evaluation.report import closing, header, log_hparams, rest, summary, write_pictures
@@ -28,7 +29,7 @@ from xplanes.scenes.datamodule import SceneDataModule, found_root
 from xplanes.training.checkpoints import find_resumable, has_checkpoint
 from xplanes.training.clock import find_callback, training_seconds
 from xplanes.training.evaluation import Evaluation
-from xplanes.training.fit import Trainer, estimate, warm_up_loops
+from xplanes.training.fit import Trainer, warm_up_loops
 from xplanes.training.module import RadianceModule
 from xplanes.training.record import (
     REFUSALS,

@@ -175,10 +175,13 @@ def test_a_nan_stays_on_its_ray(merge):
     ray, starts = rest[2:]
     clean, _ = merge(depth, *rest)
     broken = int(ray[5])
-    total, _ = merge(depth.index_fill(0, torch.tensor(5), math.nan), *rest)
+    wrong = depth.index_fill(0, torch.tensor(5), math.nan)
+    total, _ = merge(wrong, *rest)
     assert total[broken].isnan().all()
     others = torch.arange(len(starts)) != broken
     agree(total[others], clean[others], atol=1e-14, rtol=0)
+    weights, sound = (sample_weights(part, ray, starts) for part in (wrong, depth))
+    agree(weights[ray != broken], sound[ray != broken], atol=1e-14, rtol=0)
 
 
 @of_each

@@ -1,6 +1,5 @@
 """Reports of a run: header, metrics.json, hyperparameters, closing lines."""
 
-import math
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -14,7 +13,7 @@ from torch.utils.tensorboard.summary import hparams
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from xplanes import __version__, backend
-from xplanes.evaluation.render import run_track
+from xplanes.evaluation.estimate import Estimate, estimated
 from xplanes.experiment import Experiment
 from xplanes.process import resume_command
 from xplanes.rendering.pictures import write_png
@@ -23,13 +22,12 @@ from xplanes.scenes.datamodule import SceneDataModule
 from xplanes.scenes.views import Views
 from xplanes.training.checkpoints import LAST, training_so_far
 from xplanes.training.clock import training_seconds, training_share
-from xplanes.training.evaluation import affordable, log_image, scored_before_training
-from xplanes.training.fit import Estimate, Trainer
+from xplanes.training.evaluation import log_image
+from xplanes.training.fit import Trainer
 from xplanes.training.module import RadianceModule
 from xplanes.training.scores import ViewScore, blank_psnr, mean_colour, mean_scores
 
 LITTLE = 0.5  # Gain in dB over background-only images below which a run has learnt nothing.
-LONG = 30.0  # Seconds of scores and images above which the header may say how to shorten them.
 BUSY = 0.6  # CPU time per second of training on the CPU below which a run warns.
 
 CLUTTERED = 0.2
@@ -90,54 +88,6 @@ def header(
         "changed": " ".join(overrides) or "(nothing)",
     }
     return "\n".join(f"{name:<9}{text}" for name, text in lines.items())
-
-
-def estimated(
-    experiment: Experiment,
-    data: SceneDataModule,
-    module: RadianceModule,
-    expected: Estimate,
-    spent: float,
-    done: int = 0,
-    trained: float = 0.0,
-) -> str:
-    """The run's expected duration as text, ``spent`` seconds after its start.
-
-    Before a resume it had ``done`` steps in ``trained`` seconds of training.
-    """
-    trainer = experiment.trainer
-    steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf
-    seconds = trainer.get("max_seconds") or math.inf
-    train = max(0.0, min((steps - done) * expected.step, seconds - trained))
-    final = data.scene.splits[data.test_split]
-    views = data.scene.splits[data.validation_split or data.test_split]
-    at = experiment.callbacks.get("evaluation", {}).get("at", [])
-    # A number of views, or a share of them.
-    limit = affordable(trainer.get("limit_val_batches", 1.0), views)
-    count = min(limit, len(views)) if isinstance(limit, int) else int(limit * len(views))
-    pixels = views.height * views.width * count
-    whole = done + train / expected.step  # Evaluations before a resume are not repeated.
-    shares = {*at, 1.0} - (set() if scored_before_training(module.site) else {0.0})
-    steps_at = [
-        share * whole if share else 0.0 for share in shares if not done or share * whole > done
-    ]
-    images = sum(pixels * expected.ray(step) for step in steps_at)
-    if final is not views or count < len(views):
-        images += final.height * final.width * len(final) * expected.ray(whole)
-    if experiment.media:
-        assert module.frame is not None
-        cameras = run_track(data.scene, module.frame).cameras
-        images += sum(each.height * each.width for each in cameras) * expected.ray(whole)
-    parts = f"{spent:.0f} s so far, {{}} of training, {images:.0f} s of scores and images"
-    if train == math.inf:
-        return parts.format("no end")
-    text = f"{spent + train + images:.0f} s in all: {parts.format(f'{train:.0f} s')}"
-    if images > max(train, LONG):
-        text += (
-            "\n         scores and images take longer than training; to shorten them: media=false "
-            '"callbacks.evaluation.at=[1]" data.eval_views=4'
-        )
-    return text
 
 
 def summary(

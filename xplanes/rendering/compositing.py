@@ -58,12 +58,9 @@ def composite_reference(
     optical_depth: Tensor, colour: Tensor, distances: Tensor, ray: Tensor, starts: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Reference implementation of `composite`."""
-    depth = optical_depth.clamp(0, OPAQUE)
-    # A NaN must not reach other rays through the running sum; it affects only its own weight.
-    before = depth_before(depth.nan_to_num(0), ray, starts)
-    weights = before.neg().exp().to(depth.dtype) * stopped(depth)
+    weights = sample_weights(optical_depth, ray, starts)
     values = torch.cat([colour, torch.ones_like(distances)[:, None], distances[:, None]], dim=1)
-    total = torch.zeros(len(starts), 5, dtype=depth.dtype, device=depth.device)
+    total = torch.zeros(len(starts), 5, dtype=weights.dtype, device=weights.device)
     return total.index_add(0, ray, weights[:, None] * values), weights.detach()
 
 
@@ -111,7 +108,9 @@ def sample_weights(optical_depth: Tensor, ray: Tensor, starts: Tensor) -> Tensor
         Weights. [N]
     """
     depth = optical_depth.clamp(0, OPAQUE)
-    return depth_before(depth, ray, starts).neg().exp().to(depth.dtype) * stopped(depth)
+    # A NaN must not reach other rays through the running sum; it affects only its own weight.
+    before = depth_before(depth.nan_to_num(0), ray, starts)
+    return before.neg().exp().to(depth.dtype) * stopped(depth)
 
 
 def distortion(

@@ -44,7 +44,9 @@ KINDS = {
         ("lrm=tiny", "decomposition.dynamic=random", "model.loss.sparse_weight=0.0"),
     ),
     "median": Kind("static part: median over time, no robust PCA", control="median"),
-    "not regularised": Kind("neither L_r nor the distance term", ("lrm=tiny", *controls.NOT_REGULARISED)),
+    "not regularised": Kind(
+        "neither L_r nor the distance term", ("lrm=tiny", *controls.NOT_REGULARISED)
+    ),
     "LRM": Kind("the method", ("lrm=tiny",), every=True),
     "oracle": Kind("triplanes fitted to true views", control="oracle", every=True),
 }

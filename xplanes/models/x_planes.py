@@ -116,11 +116,10 @@ class XPlanesLoss(Settings):
     time_variation: Weight  # Weight of the time planes' total variation.
     time_smoothness: Weight  # Weight of time smoothness (squared second differences).
     time_magnitude: Weight  # Weight of the time planes' mean square.
-    # Weight of the cube's mean transmittance, if a background is learnt and the field is
-    # initialised randomly; it falls to 0 over `model.loss.passing_steps`. The background learns
-    # faster than the field, and would otherwise reproduce the cube's content. Time planes are not
-    # trained until then: they would build fog that differs from view to view, blocks the light and
-    # persists.
+    # Weight of the cube's mean transmittance, if a background is learnt; it falls to 0 over
+    # `model.loss.passing_steps`. The background learns faster than the field, and would otherwise
+    # reproduce the cube's content. Time planes are not trained until then: they would build fog
+    # that differs from view to view, blocks the light and persists.
     passing: Weight
     # Steps over which `model.loss.passing` falls to 0; at most 30% of the training budget.
     passing_steps: Steps
@@ -308,8 +307,6 @@ class XPlanesModel(Model):
             if self._is_rig:
                 steps = self.weights.rig_passing_steps
                 self.weights = replace(self.weights, passing_steps=steps)
-            if site.initialised:  # Its surfaces stop light already.
-                self.weights = replace(self.weights, passing=0.0)
         if field.background is not None and field.moves:
             self.total_variation = self.weights.total_variation_with_background
         elif self.fine_settings is not None:

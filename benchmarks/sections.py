@@ -173,14 +173,14 @@ def train_all(cases: Sequence[Case], work: Path, *, quick: bool = False) -> list
     """Train the runs of all cases that are not finished, and gather them; one row per case."""
     chosen = [case for case in cases if case.quick or not quick]
     counts = [1 if quick else int(min(case.seeds, LIMITS["seeds"])) for case in chosen]
-    jobs = [
-        (case, seed) for case, count in zip(chosen, counts, strict=True) for seed in range(count)
-    ]
-
-    def train(job: tuple[Case, int]) -> Measured | None:
-        case, seed = job
+    jobs: list[tuple[Case, int, Path]] = []
+    for case, count in zip(chosen, counts, strict=True):  # Hydra cannot compose in threads.
         digest = hashlib.sha256(json.dumps(settings_of(case.overrides)).encode()).hexdigest()[:8]
-        folder = work.absolute() / f"{slug(case.name)}_{seed}_{digest}"
+        start = work.absolute() / slug(case.name)
+        jobs += [(case, seed, Path(f"{start}_{seed}_{digest}")) for seed in range(count)]
+
+    def train(job: tuple[Case, int, Path]) -> Measured | None:
+        case, seed, folder = job
         finished = (folder / "metrics.json").is_file()
         if time.monotonic() > LIMITS["until"] and not finished:
             return None

@@ -31,7 +31,11 @@ COMPILING = 20
 
 @dataclass
 class WarmUp:
-    """Seconds spent loading and compiling the inner loops; the stages of a run exclude them."""
+    """Time spent loading and compiling the inner loops; the stages of a run exclude it.
+
+    Attributes:
+        seconds: Total in this process.
+    """
 
     seconds: float = 0.0
     _inside: bool = False
@@ -148,9 +152,15 @@ def proven(
 ) -> bool:
     """Whether kernels compile, run and agree with their reference implementation; logs if not.
 
-    Callers cache the result: the trial compiles the kernels and waits for the device. ``attempt``
-    calls a function on a small input of a dtype and returns values and gradients; the reference
-    computes in float32 or higher.
+    Callers cache the result: the trial compiles the kernels and waits for the device.
+
+    Args:
+        what: Name of the operation, for the message.
+        device: Device of the trial.
+        attempt: Calls a function on a small input of a dtype; returns values and gradients.
+        kernels: The kernels on trial.
+        reference: The reference implementation.
+        dtype: Dtype of the planes; the reference computes in float32 or higher.
 
     Raises:
         DeviceError: If the device no longer responds.

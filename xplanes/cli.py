@@ -85,9 +85,12 @@ def further_commands() -> list[AddCommands]:
 
 
 class Command(NamedTuple):
-    """Help of a command, its arguments as `add_argument` takes them, and what runs it.
+    """A command of the program.
 
-    Nothing runs it here where Hydra reads the command line.
+    Attributes:
+        text: Help text.
+        arguments: Positional arguments and options by name, as `add_argument` takes them.
+        run: Runs it with the parsed options; None where Hydra reads the command line.
     """
 
     text: str
@@ -127,7 +130,11 @@ COMMANDS = {
 
 
 def build_parser(further: Sequence[AddCommands] = ()) -> argparse.ArgumentParser:
-    """All commands and their options; ``further`` adds those of plug-ins."""
+    """All commands and their options.
+
+    Args:
+        further: Add the commands of plug-ins to the subparsers.
+    """
     parser = argparse.ArgumentParser(
         prog="xplanes",
         description="Dynamic radiance fields initialised from Large Reconstruction Models.",

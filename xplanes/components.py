@@ -131,7 +131,11 @@ def build(node: Mapping[str, Any], kind: type[T], key: str, **more: Any) -> T:
 
 
 def read_settings(cls: type[S], values: Mapping[str, Any]) -> S:
-    """Settings, and those nested in them, from builtins; `ConfigError` if any cannot be."""
+    """Settings, and those nested in them, from builtins.
+
+    Raises:
+        ConfigError: For a name that does not exist or is missing, or a value out of range.
+    """
     cls.require_names(values)
     hints = dict(hints_of(cls))
     return cls(**{name: _nested(name, value, hints[name]) for name, value in values.items()})
@@ -151,7 +155,12 @@ def _nested(key: str, value: Any, hint: Any) -> Any:
 
 
 def class_of(target: Any, kind: type, key: str) -> type:
-    """The class of a dotted name, if it is derived from ``kind`` and allowed; ``key`` names it.
+    """The class of a dotted name, if it is allowed in that place.
+
+    Args:
+        target: The name, as module.Class.
+        kind: Required base class.
+        key: Dotted name of the setting, for messages.
 
     Raises:
         ConfigError: If there is no such class, or it is not allowed there.

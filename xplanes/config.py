@@ -73,7 +73,15 @@ def compose_plain(name: str | None, overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def group_options(group: str, overrides: Sequence[str] = ()) -> list[str]:
-    """Names of a group's options, including those from ``hydra.searchpath`` in ``overrides``."""
+    """Names of a group's options, including those from ``hydra.searchpath``.
+
+    Args:
+        group: The group, such as ``data``.
+        overrides: ``key=value`` each.
+
+    Raises:
+        ConfigError: For overrides that Hydra cannot read.
+    """
     from hydra.core.global_hydra import GlobalHydra
 
     with _hydra("train", overrides):
@@ -189,7 +197,12 @@ def _is_quoted(value: str) -> bool:
 
 
 def near_names(overrides: Sequence[str], name: str | None = "train") -> str:
-    """Suggestions for the first override with an unknown option or key; empty if there is none."""
+    """Suggestions for the first override with an unknown option or key; empty if there is none.
+
+    Args:
+        overrides: ``key=value`` each.
+        name: File of the configuration in ``conf``, without suffix.
+    """
     from hydra import compose
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.override_parser.overrides_parser import OverridesParser

@@ -37,7 +37,11 @@ class BrokenFrameError(SceneError):
 
 
 def require_between(name: str, value: float | None, low: float, high: float) -> None:
-    """Raise `ConfigError` with name, value and range for a number out of range; None passes."""
+    """Refuse a number out of range; None passes.
+
+    Raises:
+        ConfigError: With the name, the value and the range.
+    """
     if value is not None and not low <= value <= high:
         raise ConfigError(f"{name} {value}: must lie between {low} and {high}")
 
@@ -47,13 +51,21 @@ SHOWN = 5
 
 
 def refuse_all(problems: Sequence[str]) -> None:
-    """Raise `SceneError` with the first problems of a capture and their number, if any."""
+    """Report the problems of a capture, if there are any, in one error.
+
+    Raises:
+        SceneError: With the first problems, and their number.
+    """
     if problems:
         raise SceneError(first_of(problems))
 
 
 def all_of(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """The results of a function for all items; `refuse_all` reports those for which it fails."""
+    """The results of a function for all items.
+
+    Raises:
+        SceneError: If it fails for some items; reports their problems as `refuse_all` does.
+    """
     results: list[Result] = []
     problems: list[str] = []
     for item in items:

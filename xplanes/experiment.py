@@ -85,14 +85,22 @@ class Experiment:
         return experiment
 
     def require_folder(self) -> None:
-        """Raise `SceneError` if the scene has no folder and its reader cannot fetch it."""
+        """Check that the folder of the scene exists, unless its reader may fetch it.
+
+        Raises:
+            SceneError: If it does not; the message says where to get the scene.
+        """
         fetches = type(self.data).prepare is not SceneSettings.prepare
         if self.data.files and not fetches and not self.data.folder.exists():
             self.data.load(("train",))
 
     @property
     def device(self) -> torch.device:
-        """Device on which the field is trained; `ConfigError` if the machine lacks it."""
+        """Device on which the field is trained.
+
+        Raises:
+            ConfigError: If the machine lacks the device.
+        """
         try:
             return find_device(str(self.trainer.get("accelerator", "auto")))
         except ConfigError as error:
@@ -105,7 +113,11 @@ class Experiment:
         return devices if isinstance(devices, int) and devices > 0 else 1
 
     def build_trainer(self, run: Path) -> "Trainer":
-        """The Trainer, with callbacks and loggers; `ConfigError` if one rejects its arguments."""
+        """The Trainer, with callbacks and loggers, for a run directory.
+
+        Raises:
+            ConfigError: If one of them rejects its arguments.
+        """
         from lightning.pytorch.callbacks import Callback
 
         from xplanes.training.fit import Trainer

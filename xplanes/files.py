@@ -113,7 +113,11 @@ def stand_in(path: Path) -> str | None:
 
 
 def require_writable(folder: Path) -> None:
-    """Raise `StorageError` for a folder in which no file can be written; it need not exist yet."""
+    """Refuse a folder in which no file can be written; it need not exist yet.
+
+    Raises:
+        StorageError: If no file can be written.
+    """
     place = existing(folder.absolute())
     with storage_errors(folder):
         if not place.is_dir():
@@ -123,7 +127,11 @@ def require_writable(folder: Path) -> None:
 
 
 def require_empty(folder: Path) -> None:
-    """Raise `ConfigError` for a file or a folder with files; it need not exist yet."""
+    """Refuse a path that is a file or a folder with files; it need not exist yet.
+
+    Raises:
+        ConfigError: If it is a file, or a folder with files.
+    """
     if folder.is_file():
         raise ConfigError(f"{folder} is a file: name a folder")
     if folder.is_dir() and any(folder.iterdir()):
@@ -187,7 +195,11 @@ def _finite(content: Any) -> Any:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object from a file; a `ValueError` names it if it is damaged."""
+    """A JSON object from a file.
+
+    Raises:
+        ValueError: If the file is damaged; the message names it.
+    """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:

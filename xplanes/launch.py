@@ -215,6 +215,12 @@ def _require_same_job(folder: Path, overrides: Iterable[str]) -> None:
 def prepare(arguments: list[str]) -> list[str]:
     """Replace ``resume=RUN`` by that run's overrides, and check that its folder is writable.
 
+    Args:
+        arguments: Overrides and options of Hydra.
+
+    Returns:
+        Arguments for Hydra.
+
     Raises:
         ConfigError: If Hydra cannot read the arguments, or the run cannot be resumed.
         StorageError: If the folder of the run cannot be written.
@@ -343,7 +349,11 @@ def _in_shell(text: str) -> str:
 
 
 def require_parsed(overrides: Sequence[str]) -> None:
-    """Refuse values that Hydra cannot read, with the override in quotes."""
+    """Refuse values that Hydra cannot read.
+
+    Raises:
+        ConfigError: With the override in quotes.
+    """
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 

@@ -65,7 +65,11 @@ def if_free(path: Path) -> Iterator[bool]:
 
 @contextmanager
 def alone_in(run: Path) -> Iterator[None]:
-    """Lock a run directory, or raise `ConfigError` if another process writes into it."""
+    """Lock a run directory, so that no second process writes into it.
+
+    Raises:
+        ConfigError: If another process holds it.
+    """
     run.mkdir(parents=True, exist_ok=True)
     lock = FileLock(run / RUN_LOCK)
     try:

@@ -11,7 +11,11 @@ class MissingExtraError(XPlanesError, ImportError):
 
 
 def require(module: str, *, extra: str) -> ModuleType:
-    """Import ``module``, or raise `MissingExtraError` with the extra that installs it."""
+    """Import ``module``, or say which extra installs it.
+
+    Raises:
+        MissingExtraError: If it is not installed; the message names the extra.
+    """
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -51,7 +51,11 @@ KNOWN_ERRORS = (XPlanesError, MisconfigurationException)
 class Job:
     """A run that is ready to begin: settings parsed, Trainer built, nothing written yet.
 
-    It is ``new`` if the run directory did not exist yet.
+    Attributes:
+        experiment: The settings.
+        trainer: The Trainer, with callbacks and loggers.
+        folder: The run directory, which need not exist yet.
+        new: Whether the folder did not exist yet.
     """
 
     experiment: Experiment
@@ -61,7 +65,11 @@ class Job:
 
 
 def prepare(experiment: Experiment, folder: Path) -> Job:
-    """Build the Trainer of a run; `ConfigError` if it rejects a setting."""
+    """Build the Trainer of a run.
+
+    Raises:
+        ConfigError: If one of its arguments, callbacks or loggers is rejected.
+    """
     return Job(experiment, experiment.build_trainer(folder), folder, not folder.exists())
 
 

@@ -18,7 +18,13 @@ from xplanes.errors import ConfigError
 
 @dataclass(frozen=True)
 class Range:
-    """Bounds of a number, which are themselves excluded if it is open."""
+    """Bounds of a number.
+
+    Attributes:
+        low: Lower bound.
+        high: Upper bound.
+        open: Whether the bounds themselves are excluded.
+    """
 
     low: float = -math.inf
     high: float = math.inf
@@ -81,7 +87,11 @@ class Settings:
 
     @classmethod
     def require_names(cls, names: Iterable[str]) -> None:
-        """Raise `ConfigError` for names that are not settings of this class, and missing ones."""
+        """Refuse names that are not settings of this class, and missing ones.
+
+        Raises:
+            ConfigError: For a name that does not exist, or one that is missing.
+        """
         known = {entry.name: entry for entry in fields(cls)}
         given = list(names)
         for name in given:
@@ -113,7 +123,11 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def check_arguments(function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
-    """Raise `ConfigError` for values outside the types and ranges of a function's annotations."""
+    """Refuse values outside the types and ranges of a function's annotations.
+
+    Raises:
+        ConfigError: With the argument, its value and what is allowed.
+    """
     hints = get_type_hints(function, include_extras=True)
     for name, value in arguments.items():
         if name in hints:

@@ -87,9 +87,14 @@ class PlaneProducts(nn.Module):
         return {name: plane[0] for name, plane in self.planes()[-len(self.names) :]}
 
     def forward(self, points: Tensor, times: Tensor) -> Tensor:
-        """Features of all scales, concatenated, at points in [-1, 1]^3 and times from 0 to 1.
+        """Features of points at times.
 
-        [N, 3], [N] -> [N, channels * scales]
+        Args:
+            points: Positions; the planes cover [-1, 1]^3. [N, 3]
+            times: Times from 0 to 1. [N]
+
+        Returns:
+            Features of all scales, concatenated. [N, channels * scales]
         """
         places = torch.cat([points, 2 * times[:, None] - 1], dim=1)
         found = [

@@ -112,9 +112,20 @@ class ProposalRenderer(RayRenderer):
         *,
         learn: bool = False,
     ) -> ProposalRendering:
-        """Render rays, see `RayRenderer.render`.
+        """Render rays.
 
-        Samples are stratified by ``jitter``; if ``learn``, gradients reach the density fields, too.
+        Args:
+            field: Field from points, times and, if ``view_dependent``, directions to colour and
+                density.
+            origins: Ray origins in the field's frame. [R, 3]
+            directions: Unit directions. [R, 3]
+            times: Time of each ray, from 0 to 1. [R]
+            background: Background colour. [3] or [R, 3]
+            jitter: Generator of random numbers for stratified sampling; None for no jitter.
+            learn: Whether gradients reach the density fields.
+
+        Returns:
+            The rendering; gradients reach the field.
         """
         if self.near is None or self.far is None:
             bounds = ray_box(origins, directions)

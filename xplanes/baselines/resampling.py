@@ -16,9 +16,16 @@ def ray_weights(optical_depth: Tensor) -> Tensor:
 
 
 def uniform_edges(rays: int, count: int, uniform: Tensor | None, device: torch.device) -> Tensor:
-    """Ascending edges of equal bins from 0 to 1, jittered by up to half a bin. [R, count + 1]
+    """Edges of ``count`` equal bins from 0 to 1, jittered by up to half a bin.
 
-    ``uniform`` holds random numbers from 0 to 1, or is None for no jitter. [R, count + 1]
+    Args:
+        rays: Number of rays R.
+        count: Number of bins.
+        uniform: Random numbers from 0 to 1; None for no jitter. [R, count + 1]
+        device: Device of the edges.
+
+    Returns:
+        Ascending edges. [R, count + 1]
     """
     edges = torch.linspace(0, 1, count + 1, device=device).expand(rays, -1)
     if uniform is None:

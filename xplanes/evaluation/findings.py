@@ -58,7 +58,12 @@ def stray_pixels(alpha: Tensor) -> int:
 
 
 def camera_findings(scene: Scene, frame: Frame | None) -> Iterator[Finding]:
-    """Problems of cameras and times, and views that two splits share."""
+    """Problems of cameras and times, and views that two splits share.
+
+    Args:
+        scene: The scene, with its training views and those that are scored.
+        frame: The field's frame; None if none could be estimated.
+    """
     train = scene.splits["train"]
     yield from _times(scene, train)
     yield from shared(scene)

@@ -113,6 +113,11 @@ def _depth(image: dict[str, Tensor], distance: float) -> Tensor:
 def check_video(path: Path, *, frames: int, folder: bool = False) -> None:
     """Refuse what `write_video` cannot write, before anything is rendered.
 
+    Args:
+        path: The video file, or the folder for its frames.
+        frames: Number of frames.
+        folder: Whether ``path`` is a folder for one PNG per frame.
+
     Raises:
         ConfigError: If the suffix is unknown, the folder is not empty, or ``path`` is one image
             for several frames.
@@ -236,7 +241,11 @@ def _nearest_of_each_timestep(views: Views, order: Tensor) -> Tensor:
 
 
 def pixels_with_rays(views: Views, index: int, height: int, width: int) -> Tensor | None:
-    """Pixels of another size for which a view's lens has rays; None for all. [height, width]"""
+    """Pixels of an image of another size for which a view's lens has rays; None for all.
+
+    Returns:
+        bool [height, width]
+    """
     if (known := views.intrinsics.has_ray(index)) is None:
         return None
     size = height, width

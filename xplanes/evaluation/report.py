@@ -46,7 +46,15 @@ def header(
 ) -> str:
     """The lines printed before training: software, data, model, budget and expected time.
 
-    ``spent`` are seconds since this process began; training continues from ``checkpoint``, if any.
+    Args:
+        experiment: The settings.
+        run: The run directory.
+        data: The data.
+        module: The module, with its field.
+        overrides: Overrides from the command line.
+        expected: Expected durations.
+        spent: Seconds since the start of this process's part of the run.
+        checkpoint: The checkpoint from which training continues, if any.
     """
     assert module.frame is not None
     assert module.initialisation is not None
@@ -160,7 +168,13 @@ def rest(seconds: dict[str, Any], total: float) -> dict[str, float]:
 
 
 def write_pictures(trainer: Trainer, pictures: Mapping[str, Tensor], *, log: bool) -> None:
-    """Write images of the preparation [H, W, 3] to the run's media and, if wanted, the loggers."""
+    """Write images of the preparation to the run's media and, if wanted, to the loggers.
+
+    Args:
+        trainer: The Trainer, with run directory and loggers.
+        pictures: By name, colours from 0 to 1. [H, W, 3] each
+        log: Whether to pass them to the loggers, too.
+    """
     for name, picture in pictures.items():
         write_png(Path(trainer.default_root_dir) / "media" / f"{name}.png", picture)
         if log:

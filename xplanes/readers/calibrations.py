@@ -49,7 +49,10 @@ def find_calibration(folder: Path, patterns: Sequence[str] = FILES) -> Path | No
 
 
 def read_calibrations(path: Path) -> list[tuple[str, str, np.ndarray, Calibration]]:
-    """Name, label, pose and calibration of each camera of a result of `find_calibration`.
+    """Name, label, pose and calibration of each camera.
+
+    Args:
+        path: Result of `find_calibration`.
 
     Raises:
         SceneError: If the file is not such a calibration, or if it is one of several.

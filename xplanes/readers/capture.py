@@ -26,7 +26,10 @@ from xplanes.settings import Count
 def warn_of_masks(folder: Path, images: Sequence[Path], advice: str = "") -> None:
     """Warn about files and folders that seem to be masks, but are not read.
 
-    Advice is empty if they can be named.
+    Args:
+        folder: The scene's folder.
+        images: Its images, without masks.
+        advice: What to do with masks; empty if they can be named.
     """
     folder, images = folder.resolve(), [path.resolve() for path in images]
     places = {path.parent for path in images}
@@ -140,9 +143,15 @@ class CaptureSettings(SceneSettings, ABC):
         points: np.ndarray | None = None,
         up: Tensor | None = None,
     ) -> Scene:
-        """The requested splits of a capture, from indices of each split's images in the list.
+        """The requested splits of a capture.
 
-        ``points`` are on surfaces, in the world, [N, 3]; ``up`` is its up vector in the files.
+        Args:
+            listing: All images.
+            places: Indices of each split's images in the list.
+            splits: Names of splits.
+            source: Source of the splits, for messages.
+            points: World points on surfaces. [N, 3]
+            up: The world's up vector, if the files give one. float64 [3]
 
         Raises:
             MissingSplitError: If a split has no images.

@@ -268,7 +268,14 @@ def _camera(name: str) -> str:
 
 
 def _image_folder(folder: Path, name: str, model: SparseModel) -> Path:
-    """The nearest folder of a name in or above the model's; by default, any that has the images."""
+    """The folder of the images of a model.
+
+    This is the nearest folder ``name`` in or above the model's folder. For the default name, it may
+    also be the only folder of the scene that contains the images, such as input.
+
+    Raises:
+        SceneError: If there is none.
+    """
     places = [place for place in model.source.parents if place.is_relative_to(folder)]
     for place in (*places, folder):
         if (place / name).is_dir():

@@ -122,7 +122,10 @@ def image_count(folder: Path) -> int:
 
 
 def read_model(folder: Path) -> SparseModel:
-    """Read and check the sparse model in a folder; binary files take precedence over text files.
+    """Read and check a sparse model; binary files take precedence over text files.
+
+    Args:
+        folder: Folder of cameras, images and points3D, each .bin or .txt.
 
     Raises:
         SceneError: If a file is missing, damaged, or has a lens that is not supported.

@@ -59,8 +59,13 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
     encoding of accents, as long as only one file matches; it may be percent-encoded. If there is no
     such path, its first folders are dropped one by one, as it may be a path of another machine.
     Relative names keep the folder of a split, and all folders if the last one exists. A name
-    without folders is also looked up in the folder ``images``. ``label``, the file and frame that
-    name it, and ``key`` are for messages.
+    without folders is also looked up in the folder ``images``.
+
+    Args:
+        label: The file and frame that name it, for messages.
+        folder: The scene's folder.
+        name: Name relative to ``folder``, or an absolute path into it.
+        key: The key of the name.
 
     Raises:
         BrokenFrameError: If there is no such file, or it is empty.
@@ -87,7 +92,12 @@ def image_path(label: str, folder: Path, name: Any, key: str = "file_path") -> P
 
 
 def usable(what: str, read: Callable[[Item], Found], items: Sequence[Item]) -> list[Found]:
-    """Results of a function for frames; warns about those for which it raises `BrokenFrameError`.
+    """Results of a function for usable frames; warns about the others.
+
+    Args:
+        what: Name of the frames, for the warning.
+        read: The function; raises `BrokenFrameError` for a frame that is to be left out.
+        items: The frames.
 
     Raises:
         MissingSplitError: If all frames are left out.
@@ -160,8 +170,14 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
     """Paths that a name may refer to inside ``folder``, unchanged and with image suffixes.
 
     Links are followed, even out of the folder; ``..`` must not leave it, unless nothing is there
-    and the rest of the name leads to a file inside. Arguments are those of `image_path`, and a
-    valid name for messages.
+    and the rest of the name leads to a file inside.
+
+    Args:
+        label: The file and frame that name it, for messages.
+        folder: The scene's folder.
+        name: Name relative to ``folder``, or an absolute path.
+        key: The key of the name.
+        example: A valid name, for messages.
 
     Raises:
         BrokenFrameError: If it is empty or null.
@@ -207,9 +223,11 @@ def paths_inside(label: str, folder: Path, name: Any, key: str, example: str) ->
 
 
 def mask_files(folder: Path, names: Sequence[Sequence[str]]) -> tuple[Path | None, ...]:
-    """The mask of each image, by its possible names without the ending in order of preference.
+    """The mask of each image; None for images without a mask.
 
-    None for images without a mask. [V]
+    Args:
+        folder: Folder of masks.
+        names: Possible names of each image's mask without the ending, in order of preference. [V]
 
     Raises:
         SceneError: If no image has a mask.
@@ -249,7 +267,11 @@ def unit_times(times: Sequence[float], span: tuple[float, float] | None = None) 
 
 
 def read_object(path: Path, content: str) -> dict[str, Any]:
-    """A JSON object, whose content is described for messages, from a file.
+    """A JSON object from a file.
+
+    Args:
+        path: The file.
+        content: Required content, for messages.
 
     Raises:
         SceneError: If it cannot be read, or is not an object.
@@ -292,9 +314,13 @@ def decoded(content: bytes) -> str:
 def reading(path: Path, how: str = "", advice: str = "") -> Iterator[None]:
     """Refuse a file that was not fetched, such as a pointer of Git LFS, or that cannot be read.
 
+    Args:
+        path: The file that is read in the block.
+        how: How it is read, such as "as JSON", for the message.
+        advice: Further text of the message.
+
     Raises:
-        SceneError: With the kind of placeholder, or the problem in the block, how the file is read
-            there, such as "as JSON", and advice.
+        SceneError: With the kind of placeholder, or the problem in the block.
     """
     if (other := stand_in(path)) is not None:
         raise SceneError(f"{path} {other}.")
@@ -308,7 +334,12 @@ def reading(path: Path, how: str = "", advice: str = "") -> Iterator[None]:
 
 
 def checked_pose(label: str, matrix: Any, key: str = "transform_matrix") -> np.ndarray:
-    """A camera-to-world matrix: finite, rigid, right-handed; its last row may be missing.
+    """A camera-to-world matrix: finite, rigid, right-handed.
+
+    Args:
+        label: Its file and frame, for messages.
+        matrix: 4 rows of 4 numbers; the last row may be missing.
+        key: Its key there.
 
     Returns:
         The matrix. float64 [4, 4]
@@ -412,10 +443,17 @@ def origin_near(source: Path, positions: np.ndarray, movable: bool = True) -> np
     """A point relative to which single precision resolves the cameras: if possible, the origin.
 
     Captures in map coordinates lie millions of metres away, where numbers are half a metre apart.
-    float64 [V, 3] -> float64 [3]
+
+    Args:
+        source: File of the cameras, for messages.
+        positions: Positions of all cameras of a capture. float64 [V, 3]
+        movable: Whether it may be another point than the origin.
+
+    Returns:
+        float64 [3]
 
     Raises:
-        SceneError: If there is no such point, or it is not the origin and may not be moved.
+        SceneError: If there is no such point.
     """
     extent = float(np.ptp(positions, axis=0).max())
     fixed = extent <= SAME_PLACE

@@ -85,8 +85,13 @@ def native_sizes(paths: Sequence[Path]) -> list[Size]:
 def shared_size(paths: Sequence[Path], first: str, advice: str) -> Size:
     """Height and width of image files that must have one size.
 
+    Args:
+        paths: The files, at least one.
+        first: Description of the first one, for messages.
+        advice: Further text of the message.
+
     Raises:
-        SceneError: If files are not images, or their sizes differ: names the first one, and advice.
+        SceneError: If their sizes differ, or files are not images.
     """
     size, *others = native_sizes(paths)
     for path, (height, width) in zip(paths[1:], others, strict=True):
@@ -98,7 +103,12 @@ def shared_size(paths: Sequence[Path], first: str, advice: str) -> Size:
 
 
 def width_rank(width: int, resolution: int | None) -> tuple[bool, int]:
-    """Sort key of copies of an image by width: the narrowest wide enough first, else the widest."""
+    """Sort key of copies of an image: the narrowest that is wide enough first, else the widest.
+
+    Args:
+        width: Width of the copy in pixels.
+        resolution: Wanted width in pixels; None wants the widest copy.
+    """
     is_enough = resolution is not None and width >= resolution
     return not is_enough, width if is_enough else -width
 
@@ -108,8 +118,12 @@ def final_sizes(
 ) -> list[Size]:
     """Heights and widths of images that are reduced to one width, with their own aspect ratios.
 
-    Narrower images keep their size, with a warning, as enlarged ones have no more detail. None
-    keeps all sizes.
+    Narrower images keep their size, with a warning, as enlarged ones have no more detail.
+
+    Args:
+        paths: Image files. [V]
+        native: Their sizes. [V]
+        resolution: Width in pixels; None keeps the sizes.
     """
     if resolution is None:
         return list(native)
@@ -130,8 +144,11 @@ def read_images(
 ) -> Tensor | store.StoredImages:
     """Decode images of any sizes and reduce them.
 
-    Images that take more than `store.IN_MEMORY` bytes are decoded once to a file in the cache, the
-    user's when None. All have one kind of masks and the same transparent levels. [V]
+    Images that take more than `store.IN_MEMORY` bytes are decoded once to a file in the cache.
+
+    Args:
+        pictures: At least one, with one kind of masks and the same transparent levels. [V]
+        cache: Folder of decoded images; the user's cache when None.
 
     Returns:
         The images of `Picture.decoded`, padded with zeros at the bottom and on the right.
@@ -203,7 +220,15 @@ def shrink(channels: np.ndarray, width: int, height: int) -> np.ndarray:
     """Reduce premultiplied channels: each pixel is the mean over its area.
 
     Lanczos would cause ringing in colour and alpha around every edge; means are exactly 0 in empty
-    areas. Colours stay at most alpha. float32 [4, h, w], from 0 to 255 -> uint8 [H, W, 4]
+    areas.
+
+    Args:
+        channels: Colour times alpha and alpha, from 0 to 255. float32 [4, h, w]
+        width: Columns of the result, at most those of the input.
+        height: Rows of the result, at most those of the input.
+
+    Returns:
+        Rounded pixels with colour <= alpha. uint8 [H, W, 4]
     """
     rows, columns = channels.shape[1:]
     if rows % height == 0 and columns % width == 0:

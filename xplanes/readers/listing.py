@@ -145,9 +145,16 @@ class Listing:
     ) -> "Listing":
         """A list of images that has passed the checks common to all formats.
 
-        Warns about images without a mask among others that have one. The file of the cameras, and
-        labels of the images, are for messages. Poses are float64, may be read relative to another
-        origin if ``movable``, and no times mean a static scene; ``more`` are further attributes.
+        Warns about images without a mask among others that have one.
+
+        Args:
+            source: File of the cameras, for messages.
+            labels: The file and frame of each image, for messages. [V]
+            paths: Image files. [V]
+            poses: Camera-to-world matrices with OpenGL's axes. float64 [V, 4, 4]
+            times: From 0 to 1; empty for a static scene. [V]
+            movable: Whether the poses may get another origin, if the files' is too far away.
+            **more: Further attributes.
 
         Raises:
             SceneError: If cameras are too far away, an image is listed twice, or the sizes of files
@@ -191,7 +198,13 @@ class Listing:
 
 
 def time_source(origin: str, files: Sequence[str], times: Sequence[Any]) -> str:
-    """Description of the times' source, with examples: files and times as given. [V], [V]"""
+    """Description of the times' source, with examples.
+
+    Args:
+        origin: The source.
+        files: Names of the images. [V]
+        times: Their times as given. [V]
+    """
     low, high = min(times), max(times)
     # Six digits of what differs, as clocks count from 1970.
     largest = max(abs(low), abs(high))
@@ -328,7 +341,13 @@ def _require_shapes(listing: Listing) -> None:
 
 
 def misshapen(path: Path, size: Size, camera: Calibration) -> str | None:
-    """An error message if the size of an image or video contradicts its calibration; else None."""
+    """An error message if the size of an image or video contradicts its calibration; else None.
+
+    Args:
+        path: The file.
+        size: Its height and width.
+        camera: Its calibration.
+    """
     if camera.w is None or camera.h is None:
         return None
     height, width = size
@@ -361,8 +380,13 @@ def final_intrinsics(
     """Intrinsics of images in their final sizes.
 
     Warns about perspective lenses that map no direction to some of the pixels, and about principal
-    points far from the middle. Labels, calibrations, and sizes of the files and in the end are
-    those of the images. [V]
+    points far from the middle.
+
+    Args:
+        labels: The images, for messages. [V]
+        calibrations: Their calibrations. [V]
+        native: Heights and widths of the files. [V]
+        sizes: Final heights and widths. [V]
 
     Raises:
         SceneError: If a camera's intrinsics are implausible, or if most pixels of a perspective

@@ -102,7 +102,11 @@ class MaskKind:
 
 
 def survey(masks: Sequence[Path | None], inverted: bool = False) -> MaskKind:
-    """Determine the meaning of a capture's masks, of which white pixels may be masked out. [V]
+    """Determine the meaning of a capture's masks from a sample of them.
+
+    Args:
+        masks: A file for each image, or None. [V]
+        inverted: Whether white pixels are masked out.
 
     Raises:
         SceneError: If a mask cannot be decoded.
@@ -176,8 +180,13 @@ def read_mask(path: Path, kind: MaskKind, image: Path | None = None) -> np.ndarr
 
     Masks with transparency are read from alpha; in coloured masks only black is masked out.
 
+    Args:
+        path: The file.
+        kind: Meaning of the capture's masks.
+        image: The image whose size the mask must have; None for any size.
+
     Raises:
-        SceneError: If it cannot be decoded, or has another size than its image, if that is given.
+        SceneError: If it cannot be decoded, or has another size.
     """
     grey, _ = _stored(path)
     if image is not None and grey.shape != (wanted := read_header(image)[0]):
@@ -198,7 +207,13 @@ def ignored_pixels(
     sizes: Sequence[tuple[int, int]],
     kind: MaskKind,
 ) -> Tensor:
-    """Pixels of images, reduced to sizes, with mask coverage below `KEPT`, padded. bool [V, H, W]
+    """Pixels of reduced images whose mask coverage is below `KEPT`, padded. bool [V, H, W]
+
+    Args:
+        masks: A file for each image, or None. [V]
+        images: The images. [V]
+        sizes: Their heights and widths. [V]
+        kind: As for `read_mask`.
 
     Raises:
         SceneError: If a mask cannot be decoded, or has another size than its image.

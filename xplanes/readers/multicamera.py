@@ -203,7 +203,13 @@ class Recording:
 def _without_short(
     folder: Path, recordings: list[Recording], named: Sequence[str | None]
 ) -> list[Recording]:
-    """Without cameras that stopped early, but for named ones: only frames of all are read."""
+    """Without cameras that stopped early, as only frames of all cameras are read.
+
+    Args:
+        folder: The scene's folder, for the warning.
+        recordings: All cameras.
+        named: Names of cameras that stay.
+    """
     usual = float(np.median([recording.count for recording in recordings]))
     short = [r for r in recordings if r.count < SHORT * usual and r.camera.name not in named]
     if not short or len(recordings) - len(short) < 2:
@@ -298,7 +304,11 @@ def _warn_of_timesteps(folder: Path, recordings: Sequence[Recording]) -> None:
 def _are_stamped(recordings: Sequence[Recording]) -> bool:
     """Whether to use the recordings' times: if frame rates differ, or frames are unevenly spaced.
 
-    Otherwise frames with the same number are simultaneous.
+    Otherwise frames with the same number are simultaneous. Warns if videos begin at different
+    times.
+
+    Raises:
+        SceneError: If rates differ and a recording has no times.
     """
     timed = sorted((r.rate, r.camera.source) for r in recordings if r.rate) or [(1.0, Path())]
     (slow, first), (fast, other) = timed[0], timed[-1]
@@ -328,11 +338,14 @@ def _are_stamped(recordings: Sequence[Recording]) -> bool:
 
 
 def _simultaneous(recordings: Sequence[Recording]) -> list[Recording]:
-    """The recordings, without images of timesteps that some cameras lack.
+    """The recordings, without images of timesteps that some cameras lack; warns about these images.
 
     Images of equal numbers are simultaneous; of clocks, which differ, those of the nearest ones.
     If the cameras' numbers do not overlap, they are counted from the first of each camera. Those of
     the first camera become the images' times, as all cameras may lack the same ones.
+
+    Raises:
+        SceneError: If images are missing, and other cameras have videos.
     """
     numbers = _numbers(recordings)
     each = list(numbers.values())
@@ -409,7 +422,11 @@ def _counts(recordings: Sequence[Recording]) -> str:
 
 
 def _partners(each: Sequence[Sequence[Number]], nearest: bool) -> tuple[np.ndarray, float, float]:
-    """Images that are simultaneous by their numbers, which may differ if ``nearest``.
+    """The images of all cameras that are simultaneous.
+
+    Args:
+        each: Numbers of each camera's images. [C]
+        nearest: Whether numbers may differ, as those of clocks do.
 
     Returns:
         Indices of the images of each timestep, int64 [C, T]; the largest difference between their

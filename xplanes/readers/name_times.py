@@ -225,7 +225,15 @@ def _checked(
     by_file: bool = False,
     by_camera: bool = False,
 ) -> list[Number]:
-    """The times, perhaps of files or cameras; warns, with advice, if they are implausible."""
+    """The times; warns if they are implausible.
+
+    Args:
+        names: Names of the images. [V]
+        times: Their times. [V]
+        advice: How to give others.
+        by_file: Whether the times are numbers in the files' names, even if folders are timesteps.
+        by_camera: Whether they follow the word for a camera.
+    """
     why, shown = "may be those of cameras" if by_camera else "", list(range(min(3, len(names))))
     for places in _folders(names):
         back = [pair for pair in pairwise(places) if times[pair[1]] < times[pair[0]]]

@@ -483,7 +483,14 @@ def _videos_by_name(folder: Path) -> dict[str, Path]:
 
 
 def _source(label: str, folder: Path, name: Any, named: Mapping[str, Path]) -> Path:
-    """The video or folder of images that a frame names, perhaps by an image or another ending."""
+    """The video or the folder of images that a frame names.
+
+    Args:
+        label: The file and frame, for messages.
+        folder: The scene's folder.
+        name: Name of the video, which may have another ending, of the folder, or of an image in it.
+        named: Result of `_videos_by_name`.
+    """
     for source in paths_inside(label, folder, name, "file_path", "cam00.mp4"):
         if source.is_dir() or (source.is_file() and source.suffix.lower() in videos.SUFFIXES):
             break

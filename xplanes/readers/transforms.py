@@ -126,6 +126,9 @@ def numbers(contents: Mapping[Path, Mapping[str, Any]]) -> dict[str, float]:
 
     Images that are missing do not count: programs list cameras that were never rendered. Empty if
     a frame has a time, or if names have no number that varies.
+
+    Args:
+        contents: Result of `readable`.
     """
     images: dict[str, str] = {}
     for path, content in contents.items():

@@ -47,7 +47,13 @@ SYNONYMS = {"sx1": "s1", "sy1": "s3"}
 def read_calibration(
     where: str, content: Mapping[str, Any], label: str, frame: Mapping[str, Any]
 ) -> Calibration:
-    """The camera of a frame: from its own keys, else from those of the content of the file.
+    """The camera of a frame: from its own keys, else from those of the file.
+
+    Args:
+        where: The file, for messages.
+        content: Content of the file.
+        label: The file and frame, for messages.
+        frame: Content of the frame.
 
     Raises:
         SceneError: If a key is missing or out of range, or the lens is not supported.

@@ -190,7 +190,14 @@ class ViewSettings(BatchSettings):
 
 
 class ViewBatches(Batches):
-    """Draws whole training views in random order, all of them once before any is repeated."""
+    """Draws whole training views in random order, all of them once before any is repeated.
+
+    Args:
+        views: Training views.
+        settings: The settings, with the background colour.
+        seed: The run's seed.
+        rank: Rank of this process in a distributed run.
+    """
 
     skipped = 0.0
 
@@ -239,6 +246,13 @@ class RayBatches(Batches):
     From images in files, each batch takes up to `PER_RUN` pixels from each of a few runs of
     consecutive pixels, so that it reads from few places on the disk; pixels of a kind remain
     equally likely. Near and far are distinguished more coarsely there (`RunPools`).
+
+    Args:
+        views: Training views.
+        frame: The field's frame, in which rays are returned.
+        settings: The settings.
+        seed: The run's seed.
+        rank: Rank of this process among the processes that split the rays.
 
     Attributes:
         slopes: Whether batches have ``across``, the change of each ray's direction by one pixel to
@@ -295,7 +309,12 @@ class RayBatches(Batches):
         self.slopes = True
 
     def draw(self, step: int, rays: int | None = None, errors: Tensor | None = None) -> Batch:
-        """The batch of a step, see `Batches.draw`; errors are unused without `tiles`.
+        """The batch of a step.
+
+        Args:
+            step: Its number.
+            rays: Number of rays to draw; the maximum when None.
+            errors: As in `Batches.draw`; unused without `tiles`.
 
         Returns:
             ``origins`` and unit ``directions`` in the field's frame [R, 3], ``times`` [R],

@@ -180,8 +180,13 @@ def ball_extent(
 ) -> Tensor:
     """Extent of a ball around each point in an image, from its centre along either axis.
 
-    The camera and points are as for `project`, ``radius`` is in world units, and ``stretch`` the
-    largest magnification by the lens's distortion (`Sight.stretch`).
+    Args:
+        camera_to_world: Pose of the camera. [4, 4]
+        points: Centres in the world. [N, 3]
+        radius: Radius of the balls, in world units.
+        focal: Focal lengths along x and y in pixels. [2]
+        lenses: The camera's lens; a pinhole when None.
+        stretch: Largest magnification by the lens's distortion (`Sight.stretch`).
 
     Returns:
         Upper bounds in pixels; infinity for balls that the camera touches. [N]

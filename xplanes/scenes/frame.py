@@ -210,6 +210,10 @@ def scene_frame(views: Views, hints: CubeHints = NO_HINTS) -> Frame:
     views from one side, which constrain the depth less. For opaque images, which have no
     silhouettes, the cube encloses the points in the middle of most images, if enough are known.
 
+    Args:
+        views: Training views.
+        hints: Known parts of the cube, and surface points.
+
     Raises:
         SceneError: If the cameras see no common volume.
     """
@@ -244,7 +248,12 @@ def scene_frame(views: Views, hints: CubeHints = NO_HINTS) -> Frame:
 
 
 def pixels_across(views: Views, frame: Frame) -> float:
-    """Number of image pixels across the field's cube at its centre, in the median view."""
+    """Number of image pixels across the cube at its centre, in the median view.
+
+    Args:
+        views: Training views.
+        frame: The field's frame.
+    """
     distance = (views.camera_to_world[:, :3, 3] - frame.centre).double().norm(dim=-1)
     # A camera near the centre sees the content of the cube around itself.
     distance = distance.clamp_min(0.5 / frame.scale)
@@ -253,9 +262,15 @@ def pixels_across(views: Views, frame: Frame) -> float:
 
 
 def _middle_box(views: Views, points: Tensor, centre: Tensor) -> Tensor | None:
-    """The corners of a box around points that most cameras see in the middle. [2, 3]
+    """The box, with a margin, of points that most cameras see in the middle of their images.
 
-    None if there is no such box. It must contain ``centre`` if the cameras' axes meet there.
+    Args:
+        views: Training views.
+        points: World points. [N, 3]
+        centre: Point at which the cameras look; the box must contain it if their axes meet. [3]
+
+    Returns:
+        Lower and upper corner; None if there is no such box. [2, 3]
     """
     points = points[points.isfinite().all(dim=1)]
     points = points[:: -(-len(points) // MOST_POINTS) or 1]

@@ -225,7 +225,15 @@ class Sight:
 
 
 def sight(lens: Lenses, focal: Tensor, centre: Tensor, height: int, width: int) -> Sight:
-    """Field of view of an image through its lens; focal lengths and centre are in pixels. [2]"""
+    """Field of view of an image through its lens.
+
+    Args:
+        lens: The lens.
+        focal: Focal lengths along x and y in pixels. [2]
+        centre: Principal point in pixels. [2]
+        height: Rows.
+        width: Columns.
+    """
 
     def unproject(columns: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         y = (rows.double() - centre[1]) / focal[1]

@@ -67,7 +67,16 @@ def _remove_noise(mask: np.ndarray) -> None:
 
 
 def _regions(first: np.ndarray, end: np.ndarray, pitch: int) -> np.ndarray:
-    """Label the 8-connected region of each run, from ``first`` to ``end`` - 1. int64 [N]"""
+    """Label the connected region of each run of pixels (8-connected).
+
+    Args:
+        first: Index of each run's first pixel, ascending, in rows of ``pitch`` pixels. [N]
+        end: Index after its last pixel. [N]
+        pitch: Pixels per row; the last two are never in a run.
+
+    Returns:
+        int64 [N]
+    """
     region = np.arange(len(first))
     # The runs that touch a run from the row below are consecutive.
     begin = np.searchsorted(end, first + pitch)

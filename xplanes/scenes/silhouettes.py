@@ -268,9 +268,12 @@ def _images_of_bin(bins: Tensor, place: int) -> Tensor:
 
 
 def _halved_changes(views: Views, frames: list[int]) -> tuple[Tensor | None, Tensor]:
-    """Squares of four pixels that are shown, None if all, and those that differ from their median.
+    """Squares of four pixels that are shown, and those that differ from their median over time.
 
-    bool [F, h / 2, w / 2] each, rounded up
+    Averages are compared: they are less noisy and still show lines of one pixel.
+
+    Returns:
+        bool [F, h / 2, w / 2] each, rounded up; the first is None if all pixels are shown.
     """
     # Averages are less noisy and still show lines of one pixel.
     images = []

@@ -70,7 +70,12 @@ def frames_are_equal(video: Views) -> bool:
 
 
 def as_static(scene: Scene, reason: str) -> Scene:
-    """The scene as a static one, known so for a reason: all views at time 0, one video frame."""
+    """The scene as a static one: all views at time 0, and one frame of its video.
+
+    Args:
+        scene: The scene.
+        reason: Why the scene is known to be static, for the header of a run.
+    """
 
     def at_one_time(views: Views) -> Views:
         return replace(views, times=torch.zeros_like(views.times))

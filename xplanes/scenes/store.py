@@ -312,7 +312,11 @@ def images(
 
 
 def in_memory(sizes: Sequence[Size], jobs: Sequence[Job]) -> Tensor:
-    """Decode images to one tensor, padded with zeros at the bottom and on the right, see `images`.
+    """Decode images to one tensor, padded with zeros at the bottom and on the right.
+
+    Args:
+        sizes: Height and width of each image. [V]
+        jobs: Each decodes some of the images, in a thread.
 
     Returns:
         Premultiplied colour and alpha. uint8 [V, H, W, 4]

@@ -60,8 +60,10 @@ def read_camera_path(path: Path) -> CameraPath:
     optionally ``time``; ``camera_angle_x`` (horizontal, in radians), once or in each frame;
     optionally ``w``, ``h`` and ``fps``.
 
-    Poses are in the run's world coordinates, with OpenGL's axes. If the file has no times, they run
-    from 0 to 1 over the path.
+    If the file has no times, they run from 0 to 1 over the path.
+
+    Args:
+        path: The file. Poses are in the run's world coordinates, with OpenGL's axes.
 
     Raises:
         SceneError: If the file is missing or damaged, or an entry is missing or out of range.

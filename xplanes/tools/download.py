@@ -38,6 +38,10 @@ def fetch(url: str, path: Path) -> None:
     Another call resumes an interrupted download if the server supports range requests. It does not
     check whether the file has changed on the server meanwhile: the caller checks the content.
 
+    Args:
+        url: Address, http or https.
+        path: The file, which is written atomically.
+
     Raises:
         FetchError: The server cannot be reached or refuses, or the disk is too full.
     """
@@ -152,6 +156,10 @@ def download_dnerf(root: Path, *, url: str = DNERF_URL) -> Path:
 
     The next call resumes an interrupted download. Existing scenes are not changed. An archive that
     was downloaded manually is used if it is in ``root`` as dnerf.zip.
+
+    Args:
+        root: Folder for one folder per scene; created if missing.
+        url: Address of the archive.
 
     Returns:
         The folder of the scenes, which is the value for data.root.

@@ -86,9 +86,20 @@ def draw(
     at_once: int = 8192,
     stop: Callable[[], bool] = lambda: False,
 ) -> Picture | None:
-    """Render a picture; None once ``stop`` returns true, which is asked every ``at_once`` rays.
+    """Render a picture.
 
-    The silhouettes of the training views identify floaters. The picture is on the CPU.
+    Args:
+        field: The field.
+        renderer: The renderer.
+        shot: Camera, time and mode.
+        views: Training views, whose silhouettes identify floaters.
+        frame: The field's frame.
+        background: Background colour. [3]
+        at_once: Rays per call of ``stop``, with a `RayRenderer`.
+        stop: Function that returns whether to abandon the picture.
+
+    Returns:
+        The picture on the CPU; None once ``stop`` returns true.
     """
     device, box = renderer.device, shot.box
     field = snapshot(field, shot.time)
@@ -149,8 +160,13 @@ def shift(renderer: Renderer, position: Tensor, views: Views, frame: Frame) -> f
     """Distance by which to move ray origins for a renderer with near and far bounds.
 
     The bounds fit cameras as far from the scene as the training cameras; at other distances they
-    would cut the scene off. Origins are moved backwards by at most the near bound. The position of
-    the camera [3] is in the field's frame.
+    would cut the scene off. Origins are moved backwards by at most the near bound.
+
+    Args:
+        renderer: The renderer; its ``near``, in the field's frame, is used if it has one.
+        position: Position of the camera, in the field's frame. [3]
+        views: Training views.
+        frame: The field's frame.
     """
     near = getattr(renderer, "near", None)
     if near is None:
@@ -160,7 +176,12 @@ def shift(renderer: Renderer, position: Tensor, views: Views, frame: Frame) -> f
 
 
 def mark(colours: Tensor, share: Tensor) -> Tensor:
-    """A pale grey picture [H, W, 3] with visible floaters, by their opacity [H, W], in red."""
+    """A pale grey picture with visible floaters in red.
+
+    Args:
+        colours: The picture. [H, W, 3]
+        share: Opacity of the floaters. [H, W]
+    """
     grey = (0.4 + 0.6 * colours.mean(dim=-1, keepdim=True)).expand_as(colours)
     strength = torch.where(share > VISIBLE, 0.5 + 0.5 * share, 0)[..., None]
     return torch.lerp(grey, colours.new_tensor(RED).expand_as(colours), strength)

@@ -29,8 +29,10 @@ SMALLEST = 32
 def evaluate(trained: TrainedRun, network: str | None = None) -> dict[str, Any]:
     """Compute scores of all views of the run's split, with the same code as in training.
 
-    The backbone of LPIPS is ``vgg`` or ``alex``, downloaded if necessary; ``none`` for no LPIPS;
-    None for vgg if it is already downloaded.
+    Args:
+        trained: The run.
+        network: Backbone of LPIPS, ``vgg`` or ``alex``, downloaded if necessary; ``none`` for no
+            LPIPS; None for vgg if it is already downloaded.
 
     Returns:
         Content for `write_scores`: scores with the keys of metrics.json, and ``not_computed``, a

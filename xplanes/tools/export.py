@@ -52,9 +52,18 @@ Z_UP_TO_Y_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Options of `xplanes export`, which its help explains.
+    """Options of `xplanes export`.
 
-    The threshold is a density per unit length of the field's frame.
+    Attributes:
+        what: ``mesh``, ``points``, ``planes``, ``path``, ``web``, or a name in the field's
+            `exports`.
+        times: A number of times spread evenly from 0 to 1, or times separated by commas; None for
+            10 times, 24 for a web page, or 1 for a static scene.
+        resolution: Grid points along each side of the field's cube.
+        threshold: Density of the surface, per unit length of the field's frame; None for the
+            result of `find_threshold`.
+        count: Points of a point cloud; None for 100,000, or for a mesh in a web page.
+        form: File format of meshes and point clouds: ``ply`` or ``glb``.
     """
 
     what: str = "mesh"
@@ -100,7 +109,11 @@ def _mesh_tools() -> tuple[Any, Any]:
 
 
 def export_times(text: str) -> list[float]:
-    """Times from "5" (evenly spread from 0 to 1) or "0,0.25,1" (a list); else a `ConfigError`."""
+    """Times from "5" (evenly spread from 0 to 1) or "0,0.25,1" (a list).
+
+    Raises:
+        ConfigError: If it is neither.
+    """
     try:
         if text.isdecimal() and 1 <= int(text) <= 100_000:
             return torch.linspace(0, 1, int(text)).tolist()
@@ -119,8 +132,13 @@ def export_times(text: str) -> list[float]:
 def export(trained: TrainedRun, options: ExportOptions, out: Path | None = None) -> Path:
     """Export a run for other programs, and list the files in ``export.json``.
 
-    The folder ``out``, empty or new, is ``export/WHAT`` in the run directory when None; it is
-    returned.
+    Args:
+        trained: The run.
+        options: Content and format of the export.
+        out: Folder to write into, empty or new; ``export/WHAT`` in the run directory when None.
+
+    Returns:
+        The folder.
 
     Raises:
         ConfigError: If options are out of range, do not fit the run, or the field shows nothing.

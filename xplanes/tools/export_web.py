@@ -150,7 +150,10 @@ def _packed_shape(shape: Shape) -> dict[str, Any]:
 
 
 def packed(values: np.ndarray) -> bytes:
-    """Arrange little-endian integers [N, C] as bytes that compress well; the page has the inverse.
+    """Arrange unsigned integers as bytes that compress well; the page has the inverse.
+
+    Args:
+        values: Little-endian. [N, C]
 
     Returns:
         Differences between rows, modulo the type's range, column by column; each column has all

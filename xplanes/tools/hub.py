@@ -36,7 +36,13 @@ def push(
     private: bool = False,
     endpoint: str | None = None,
 ) -> str:
-    """Upload a run with a model card to USER/REPOSITORY, which is created if it does not exist.
+    """Upload a run with a model card.
+
+    Args:
+        run: The run directory.
+        repository: USER/REPOSITORY; created if it does not exist.
+        private: Whether a new repository is private.
+        endpoint: Address of the hub; the default when None.
 
     Returns:
         The repository's address.
@@ -86,10 +92,13 @@ def push(
 def fetch(address: str, *, outputs: Path = OUTPUTS, endpoint: str | None = None) -> Path:
     """Download a run, or the files that have changed since its last download.
 
-    The address is hf://USER/REPOSITORY, optionally with @REVISION.
+    Args:
+        address: hf://USER/REPOSITORY, optionally with @REVISION.
+        outputs: Folder of runs; the run is saved in its subfolder hub/USER/REPOSITORY.
+        endpoint: Address of the hub; the default when None.
 
     Returns:
-        The run directory, ``outputs``/hub/USER/REPOSITORY.
+        The run directory.
 
     Raises:
         ConfigError: If the hub cannot be reached or has no such run.

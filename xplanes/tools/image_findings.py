@@ -61,7 +61,13 @@ class ImageFacts:
 
 
 def image_facts(views: Views, background: Tensor, frame: Frame | None) -> list[ImageFacts]:
-    """Statistics of the pixels of at most `MOST_VIEWS` images; colours are from 0 to 1."""
+    """Statistics of the pixels of at most `MOST_VIEWS` images of a split.
+
+    Args:
+        views: The views of the split.
+        background: Background colour, from 0 to 1. [3]
+        frame: The field's frame; None if the cameras see no common volume.
+    """
     return [_facts_of(views, i, background, frame) for i in spread(MOST_VIEWS, len(views))]
 
 
@@ -136,9 +142,13 @@ def image_findings(scene: Scene, images: Mapping[str, list[ImageFacts]]) -> Iter
 def texel_findings(
     per_texel: float, wide: int, resolution: int, *, fine: bool
 ) -> Iterator[Finding]:
-    """Warn if training images have far more detail than the planes can represent.
+    """Warn if the images have far more detail than the planes can represent.
 
-    ``fine``: the model can have additional finer planes (``model.fine``).
+    Args:
+        per_texel: Pixels of the images in training per texel of the planes.
+        wide: Width of these images.
+        resolution: Texels along an axis of the planes.
+        fine: Whether the model can have additional finer planes (``model.fine``).
     """
     if per_texel > COARSE:
         width = max(1, round(wide * 0.5 * COARSE / per_texel))

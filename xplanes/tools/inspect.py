@@ -45,10 +45,14 @@ NATIVE = "data.resolution=null"  # The setting that reads images at their native
 
 @dataclass(frozen=True)
 class Choice:
-    """The settings with which a capture is read; ``overrides`` of train.py read the same.
+    """The settings with which a capture is read.
 
-    The usual width is that of the images in the format's YAML file, if the native size is read by
-    default instead; None otherwise.
+    Attributes:
+        overrides: Settings of train.py that read the same capture.
+        scene: The settings of the scene.
+        model: The settings of the model, for the field's frame and the resolution of its planes.
+        usual_width: Width of the images in the format's YAML file, if the native size is read by
+            default instead; None otherwise.
     """
 
     overrides: tuple[str, ...]
@@ -84,7 +88,13 @@ class Capture:
 
 @dataclass(frozen=True)
 class CameraGroup:
-    """The views of one physical camera; its name is their folder if that distinguishes cameras."""
+    """The views of one physical camera, judged by poses and lenses.
+
+    Attributes:
+        name: Folder of the views if it distinguishes the cameras, else a number.
+        indices: Indices of the views.
+        fixed: Whether the camera is static.
+    """
 
     name: str
     indices: list[int]
@@ -182,7 +192,11 @@ def _recognised(folder: Path, changed: Sequence[str]) -> tuple[Path, str]:
 
 
 def inspect(choice: Choice) -> Capture:
-    """Read a capture and check it; `SceneError` if it cannot be used."""
+    """Read a capture and check it.
+
+    Raises:
+        SceneError: If it cannot be used.
+    """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         choice.scene.prepare()
@@ -446,7 +460,11 @@ def _width_of_training(choice: Choice, scene: Scene) -> int | None:
 
 
 def check_out(out: Path, settings: SceneSettings) -> None:
-    """Raise `ConfigError` if the file of the picture is no PNG, or is in the scene's folder."""
+    """Check the file of the picture.
+
+    Raises:
+        ConfigError: If it is no PNG, or is in the folder of the scene.
+    """
     if out.suffix.lower() != ".png":
         raise ConfigError(f"--out {out}: must end in .png")
     folder = settings.folder.resolve()

@@ -28,7 +28,11 @@ def read_published() -> list[Entry]:
 
 
 def check_published(names: object) -> list[str]:
-    """The names, if they are a list of tables in published.csv; else a `ConfigError`."""
+    """Check names of published tables, and return them.
+
+    Raises:
+        ConfigError: If ``names`` is not a list of names of tables in published.csv.
+    """
     known = list(dict.fromkeys(entry["table"] for entry in read_published()))
     if not isinstance(names, list) or any(name not in known for name in names):
         raise ConfigError(
@@ -38,11 +42,17 @@ def check_published(names: object) -> list[str]:
 
 
 def beside(rows: Sequence[RunRow], tables: Sequence[str] = ()) -> str | None:
-    """Compare means of a sweep's finished runs with published results; None if none matches.
+    """Compare means of a sweep's finished runs with published results.
 
     Published results are matched with runs on D-NeRF's scenes with all views by model, LRM, sampler
-    and, if they state it, the resolution of the planes. ``tables`` are shown completely, whatever
-    the data.
+    and, if they state it, the resolution of the planes.
+
+    Args:
+        rows: Runs of the sweep.
+        tables: Published tables to show completely, whatever the data.
+
+    Returns:
+        Text and tables in markdown; None if no published result matches.
     """
     entries = [e for e in read_published() if not tables or e["table"] in tables]
     scored = [entry for entry in entries if entry["psnr"]]

@@ -42,9 +42,25 @@ LARGEST = 8192  # Most pixels per side; WebP allows twice as many.
 
 @dataclass(frozen=True)
 class VideoOptions:
-    """Options of `xplanes render`, which its help explains.
+    """Options of `xplanes render`.
 
-    Without ``out``, the file is in the run's media/ and is named after the options.
+    Attributes:
+        path: Camera: ``orbit``, ``fixed`` (the first camera of the orbit), ``cameras`` (those of
+            the training views, see `training_path`), ``view:FILE``, a camera path, FILE.json, or
+            ``auto``, see `chosen_for`.
+        time: ``sweep`` (from 0 to 1), ``back-and-forth``, ``own`` (that of ``view:FILE``), or a
+            number from 0 to 1; None for ``own`` in a single image of a view, for the times of a
+            camera path or of ``cameras``, or for back-and-forth.
+        frames: Number of frames; None for 48, for 1 if a fixed camera or a view shows one time, or
+            for one per camera of a camera path.
+        fps: Frames per second; None for 16, or the rate in the camera path.
+        size: Pixels of the longer side; None for the size of the training views, of the view that
+            ``path`` names, or the size in the camera path. Frames of an orbit or a fixed camera
+            are square.
+        elevation: Elevation of orbit and fixed camera, in degrees.
+        what: ``colour`` or ``depth``.
+        out: A file (.webp, .mp4, .png, .jpg), or a folder if it ends in /; None for a file in the
+            run's media/ that is named after the options.
     """
 
     path: str = "auto"
@@ -71,7 +87,11 @@ class VideoOptions:
 
     @cached_property
     def cameras(self) -> CameraPath | None:
-        """The camera path, read from its file; None if ``path`` is another kind of camera."""
+        """The camera path, read from its file; None if ``path`` is another kind of camera.
+
+        Raises:
+            SceneError: If it cannot be used.
+        """
         return read_camera_path(Path(self.path)) if self.path.endswith(".json") else None
 
     @property
@@ -172,7 +192,19 @@ class VideoOptions:
 
 
 def render_video(trained: TrainedRun, options: VideoOptions) -> Path:
-    """Render and write a video, and return its file or folder; fails as the options' check does."""
+    """Render and write a video.
+
+    Args:
+        trained: The run.
+        options: Cameras, times and size of the frames, and where to write them.
+
+    Returns:
+        The file or folder that was written.
+
+    Raises:
+        ConfigError: If options are out of range or contradict one another.
+        ImportError: For .mp4 without the extra ``video``.
+    """
     options.check()
     options = options.chosen_for(trained.scene)
     track = options.track(trained.scene, trained.frame)
@@ -199,7 +231,11 @@ def render_video(trained: TrainedRun, options: VideoOptions) -> Path:
 
 
 def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:
-    """Split and index of a view by file name, with or without extension; else a `ConfigError`."""
+    """Find a view by file name, with or without extension; returns its split and its index there.
+
+    Raises:
+        ConfigError: If there is no such view; the message lists similar names.
+    """
     known = {file: (v, index) for v in splits.values() for index, file in enumerate(v.files)}
     for file, found in known.items():
         if name in (file, file.rsplit(".", 1)[0]):
@@ -212,7 +248,11 @@ def find_view(splits: dict[str, Views], name: str) -> tuple[Views, int]:
 
 
 def times(name: str, count: int) -> Tensor:
-    """Time of each frame: ``sweep``, ``back-and-forth`` or a number; else `ConfigError`. [F]"""
+    """Time of each frame, from 0 to 1. [F]
+
+    Raises:
+        ConfigError: If ``name`` is neither ``sweep``, ``back-and-forth`` nor a number from 0 to 1.
+    """
     if name == "sweep":
         return torch.linspace(0, 1, count)
     if name == "back-and-forth":

@@ -26,10 +26,18 @@ LISTED = 5
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """A run with its scene and the field of its ``last`` or ``best`` checkpoint.
+    """A run with its scene and trained field.
 
-    The scene has the training views and those of ``split``; poses that training has corrected are
-    corrected. The module is in evaluation mode.
+    Attributes:
+        path: The run directory.
+        experiment: The settings.
+        scene: The scene, with the training views and one more split; poses that training has
+            corrected are corrected.
+        split: Name of the other split.
+        frame: The field's frame.
+        module: The trained module, in evaluation mode.
+        checkpoint: ``last`` or ``best``.
+        step: Step of the checkpoint.
     """
 
     path: Path
@@ -137,7 +145,15 @@ def load_run(
 
 
 def read_experiment(run: Path, plugins: Sequence[str] = ()) -> Experiment:
-    """The settings of a run, which may name classes of ``plugins``; `ConfigError` if unusable."""
+    """The settings of a run directory.
+
+    Args:
+        run: The run directory.
+        plugins: User modules with classes that the settings may name.
+
+    Raises:
+        ConfigError: If they are missing, damaged, or from another version.
+    """
     content, version = read_config(run), _record(run).get("xplanes")
     try:
         return Experiment.read(content, plugins)

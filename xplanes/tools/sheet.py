@@ -44,8 +44,18 @@ def write_sheet(
 ) -> Path:
     """Write a contact sheet of all runs in a folder.
 
-    With "runs", one seed per setting is shown, unless all runs differ only in their seed. The help
-    of `xplanes sheet` explains the options.
+    With "runs", one seed per setting is shown, unless all runs differ only in their seed.
+
+    Args:
+        folder: A run, a sweep, or any folder of runs.
+        out: A PNG file, or with "steps" also a WebP video with a frame per step;
+            ``folder/sheet_WHAT.png`` when None.
+        what: One of `WHAT`.
+        show: Quantity to show, one of `xplanes.rendering.pictures.STRIP`.
+        view: Name of the view, as in ``media``, or a unique ending of it; None for the middle one
+            of those that all runs of a scene have.
+        steps: Steps to show; None for all, or with "runs" for the last.
+        size: Pixels of a tile's longer side.
 
     Raises:
         ConfigError: If there are no runs, pictures, such view or step, or ``view`` is ambiguous.
@@ -84,7 +94,11 @@ def _one_seed(rows: list[RunRow]) -> list[RunRow]:
 
 
 def check_what(what: str | None) -> None:
-    """Raise `ConfigError` if a kind of sheet is neither None nor one of `WHAT`."""
+    """Check a kind of sheet.
+
+    Raises:
+        ConfigError: If it is neither None nor one of `WHAT`.
+    """
     if what is not None and what not in WHAT:
         raise ConfigError(
             f"hydra.callbacks.table.sheet={what}: must be null or one of {', '.join(WHAT)}"

@@ -99,7 +99,11 @@ class RunRow:
 
 
 def read_rows(folder: Path) -> list[RunRow]:
-    """All runs below a folder, and jobs without a run; `ConfigError` if there are none."""
+    """All runs in a folder, at any depth, and the jobs of sweeps without a run directory.
+
+    Raises:
+        ConfigError: If the folder does not exist or contains no runs.
+    """
     if not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder")
     rows, groups = [], list(_groups(folder))

@@ -41,10 +41,15 @@ from xplanes.tools.tabulate import (
 
 
 def write_tables(folder: Path, out: Path | None = None) -> str:
-    """Tabulate all runs in a folder; return the content of table.md.
+    """Tabulate all runs in a folder.
 
-    ``out``, by default the folder itself, gets table.md, table.csv, table_seeds.csv (if there are
-    several seeds), and with the extra ``plots`` curves.png and against.png.
+    Args:
+        folder: A sweep, or any folder of runs.
+        out: Output folder; ``folder`` when None. It gets table.md, table.csv, table_seeds.csv (if
+            there are several seeds), and with the extra ``plots`` curves.png and against.png.
+
+    Returns:
+        Content of table.md.
 
     Raises:
         ConfigError: If there are no runs in the folder.
@@ -113,7 +118,11 @@ PLACES = 60
 
 
 def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
-    """Plot PSNR against seconds and steps, a column per scene; false if there are no curves."""
+    """Plot PSNR against seconds, preparation included, and against steps, a column per scene.
+
+    Returns:
+        Whether a plot was written: it needs curves and matplotlib (extra ``plots``).
+    """
     over = [name for name in names if name not in (SEED, SCENE)]
     lines: dict[tuple[str, str], list[tuple[Point, ...]]] = {}
     for row in rows:
@@ -151,9 +160,10 @@ def plot_curves(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> boo
 
 
 def plot_against(rows: Sequence[RunRow], names: Sequence[str], path: Path) -> bool:
-    """Plot final PSNR, as mean over scenes and seeds, against a setting of three values or more.
+    """Plot final PSNR, as mean over scenes and seeds, against a setting with at least three values.
 
-    False if there is not exactly one such setting.
+    Returns:
+        Whether a plot was written: it needs exactly one such setting, and matplotlib.
     """
     done = [row for row in rows if "psnr" in row.scores]
     numeric = {}
@@ -269,10 +279,16 @@ class SweepTable(Callback):
 
 
 def choose_gpu(job: int, environment: MutableMapping[str, str]) -> str | None:
-    """Set ``CUDA_VISIBLE_DEVICES`` to the GPU of a parallel job; None if there are fewer than two.
+    """Choose a GPU for a parallel job: job number modulo number of GPUs.
 
-    It is job number modulo number of GPUs. A process keeps the GPU of its first job, because CUDA
-    reads the variable only once.
+    A process keeps the GPU of its first job, because CUDA reads ``CUDA_VISIBLE_DEVICES`` only once.
+
+    Args:
+        job: Number of the job within the sweep.
+        environment: Environment; its ``CUDA_VISIBLE_DEVICES`` is read, and set to the chosen GPU.
+
+    Returns:
+        The GPU; None if there are fewer than two.
     """
     listed = environment.get("CUDA_VISIBLE_DEVICES")
     if listed is None:

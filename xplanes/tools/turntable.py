@@ -32,10 +32,15 @@ SAMPLES, CELLS = 192, 64  # Steps along the diagonal; cells of the grid per side
 
 
 def write_triplanes(paths: Sequence[Path], out: Path, experiment: Experiment) -> Path:
-    """Encode images, or folders of them, into triplanes; write them and a turntable video.
+    """Encode images into triplanes; write them and a turntable video.
 
-    The video has the name of ``out``, .safetensors or .pt, with .webp, and is returned. Of the
-    settings only those of the LRM, the cache and the device are used.
+    Args:
+        paths: Images, or folders of them.
+        out: File to write, .safetensors or .pt; the video has the same name with .webp.
+        experiment: Settings of the LRM, the cache and the device; others are ignored.
+
+    Returns:
+        The video file.
 
     Raises:
         ConfigError, LRMError, SceneError: If a setting, the weights or an image cannot be used.
@@ -82,7 +87,11 @@ def write_triplanes(paths: Sequence[Path], out: Path, experiment: Experiment) ->
 
 
 def find_pictures(paths: Sequence[Path]) -> list[Path]:
-    """Image files, those of folders in natural order; `SceneError` if there are none."""
+    """Image files; for a folder, all its images in natural order of their names.
+
+    Raises:
+        SceneError: If a path is missing, or there are no images.
+    """
     found: list[Path] = []
     for path in paths:
         if path.is_dir():
@@ -100,9 +109,12 @@ def find_pictures(paths: Sequence[Path]) -> list[Path]:
 
 
 def turntable(triplanes: Tensor, model: LRM, device: torch.device) -> Iterator[Tensor]:
-    """Frames of a camera orbit around triplanes [T, 3, C, H, H], one after another.
+    """Frames of a camera orbit that begins at the model's canonical camera.
 
-    It begins at the canonical camera of the LRM that produced them.
+    Args:
+        triplanes: One or more triplanes, shown one after another. [T, 3, C, H, H]
+        model: The LRM that produced them.
+        device: Device to render on.
 
     Yields:
         Images with a white background. uint8 [SIDE, SIDE, 3]

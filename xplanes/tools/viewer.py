@@ -53,9 +53,12 @@ def camera_pose(wxyz: Tensor, position: Tensor) -> Tensor:
 
 
 def check_address(host: str, port: int, *, key: str) -> None:
-    """Check that an address can be served; port 0 is any free one.
+    """Check that an address can be served.
 
-    In ``key``, the settings' name in messages, ``host`` or ``port`` replaces the braces.
+    Args:
+        host: Name or address of this machine.
+        port: From 0 to 65535; 0 for any free one.
+        key: Name of the settings in messages; ``host`` or ``port`` replaces the braces.
 
     Raises:
         ConfigError: If the port is taken or out of range, or the host is not this machine.
@@ -318,12 +321,19 @@ class Viewer:
 
 @dataclass
 class _Browser:
-    """State of one connected browser; ``client`` is viser's handle.
+    """State of one connected browser.
 
-    ``version`` counts changes of its camera and the controls, the last of which was at ``changed``.
-    Its last picture is of version ``drawn`` and training step ``step``, was ``began`` then, and is
-    ``sharp`` if it has the full size. If only the field changes, the next one waits until
-    ``again``. The rate is in pixels per second.
+    Attributes:
+        viewer: The viewer.
+        client: Viser's handle of the browser.
+        version: Number of changes of its camera and the controls.
+        changed: Time of the last change.
+        drawn: ``version`` of its last picture.
+        step: Training step of its last picture.
+        sharp: Whether its last picture has the full size.
+        began: Time at which rendering of its last picture began.
+        again: Earliest time of the next picture, if only the field has changed.
+        rate: Rendering speed in pixels per second.
     """
 
     viewer: Viewer

@@ -160,6 +160,10 @@ class Tensor4D(SurfaceField):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Signed distance and its gradient through the flow; all results are differentiable.
 
+        Args:
+            points: Positions. [N, 3]
+            times: Times from 0 to 1. [N]
+
         Returns:
             Distance [N], gradient with respect to the points [N, 3], features for the colour
             [N, width], and the points in canonical space [N, 3].

@@ -135,7 +135,12 @@ class NeusRenderer(RayRenderer):
     ) -> Tensor:
         """Ascending distances at which sections begin. [R, samples + more]
 
-        Uniform samples are moved by up to half a step, by random numbers ``jitter`` in [0, 1]. [R]
+        Args:
+            field: As for `render`.
+            origins: [R, 3]
+            directions: Unit directions. [R, 3]
+            times: [R]
+            jitter: Random numbers from 0 to 1 that move uniform samples by up to half a step. [R]
         """
         closest = -(origins * directions).sum(dim=1, keepdim=True)
         steps = torch.linspace(-1, 1, self.samples, device=origins.device)

@@ -115,7 +115,14 @@ class FixedStepRenderer(RayRenderer):
 
     @torch.no_grad()
     def place(self, origins: Tensor, directions: Tensor, box: Tensor, step: float) -> Samples:
-        """All samples of rays [R, 3] in a box [2, 3] and between near and far, ``step`` apart."""
+        """All samples of rays in the box and between near and far.
+
+        Args:
+            origins: [R, 3]
+            directions: Unit directions. [R, 3]
+            box: Least and largest corner. [2, 3]
+            step: Distance between samples.
+        """
         enter, leave = self.ends(origins, directions, box)
         count = ((leave - enter) / step).ceil().long().clamp_min(1)
         number = torch.arange(int(count.max()) if len(count) else 0, device=count.device)

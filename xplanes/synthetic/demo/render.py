@@ -50,10 +50,17 @@ def image_samples(
     samples: int,
     angle_x: float,
 ) -> Tensor:
-    """Mean of the values of all rays of each pixel. [resolution, resolution, 4]
+    """Mean of the values of all rays of each pixel.
 
-    ``see`` maps origins and unit directions [N, 3] to values [N, 4]; for the other arguments see
-    `render_image`.
+    Args:
+        see: Function from origins and unit directions [N, 3] to values [N, 4].
+        camera_to_world: Camera-to-world matrix. [4, 4]
+        resolution: Height and width in pixels.
+        samples: Rays per pixel and axis.
+        angle_x: Field of view in radians.
+
+    Returns:
+        [resolution, resolution, 4]
     """
     steps = (torch.arange(resolution * samples) + 0.5) / samples - 0.5
     rows, columns = torch.meshgrid(steps, steps, indexing="ij")

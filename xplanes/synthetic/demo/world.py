@@ -48,7 +48,15 @@ class World:
         samples: int = 2,
         angle_x: float = CAMERA_ANGLE_X,
     ) -> tuple[NDArray, NDArray]:
-        """Render one image of an object at a time, with these surroundings; see `render_image`.
+        """Render one image of an object with these surroundings.
+
+        Args:
+            thing: The object.
+            time: From 0 to 1.
+            camera_to_world: Camera-to-world matrix. [4, 4]
+            resolution: Height and width in pixels.
+            samples: Rays per pixel and axis.
+            angle_x: Field of view in radians.
 
         Returns:
             Colours, uint8 [resolution, resolution, 3], and the share of each pixel that the object

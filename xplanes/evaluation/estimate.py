@@ -147,7 +147,14 @@ def estimated(
 ) -> str:
     """The run's expected duration as text, ``spent`` seconds after its start.
 
-    Before a resume it had ``done`` steps in ``trained`` seconds of training.
+    Args:
+        experiment: The settings.
+        data: The data.
+        module: The module, with its field.
+        expected: Expected durations.
+        spent: Seconds so far.
+        done: Steps before a resume.
+        trained: Seconds of training before it.
     """
     trainer = experiment.trainer
     steps = float(trainer.get("max_steps", -1)) if trainer.get("max_steps", -1) > 0 else math.inf

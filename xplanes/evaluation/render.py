@@ -84,7 +84,13 @@ def render_path(
 ) -> Iterator[Tensor]:
     """Render the frames of a video, one at a time.
 
-    ``what`` is ``colour``, or ``depth`` as colours on the same scale in all frames.
+    Args:
+        field: A field that the renderer accepts.
+        renderer: The renderer.
+        frame: The field's frame.
+        track: Cameras and times.
+        background: Colour behind the scene. [3]
+        what: ``colour``, or ``depth`` as colours on the same scale in all frames.
 
     Yields:
         Pictures. uint8 [rows, columns, 3]

@@ -76,9 +76,15 @@ def scene_of(
 ) -> Scene:
     """The scene of listed images, which are decoded here.
 
-    ``masks`` are those of the whole capture, from which their meaning is determined for all splits,
-    and what their source says of it, as in `Listing`. ``up`` describes the up direction, and is
-    empty if the files' world is unchanged.
+    Args:
+        settings: Settings with its folder and the width of its images.
+        parts: The images of each split.
+        mask_use: Meaning of the black parts of masks.
+        masks: Masks of the whole capture, from which their meaning is determined for all
+            splits, and what their source says of it, as in `Listing`.
+        up: Description of the up direction; empty if the files' world is unchanged.
+        video: Frames of a fixed camera, if there are some.
+        points: World points on surfaces, if known. [N, 3]
 
     Raises:
         SceneError: If an image or a mask cannot be used, or with mask_use lrm if no training

@@ -154,7 +154,14 @@ def _has_regions(grey: np.ndarray) -> bool:
 def chosen_use(
     use: MaskUse, kind: MaskKind, where: str, told: Meaning | None
 ) -> tuple[MaskUse, str]:
-    """The use of a capture's masks by ``data.mask_use``, and a description; warns if ambiguous."""
+    """The use of a capture's masks, and a description; warns if it is ambiguous.
+
+    Args:
+        use: The setting ``data.mask_use``.
+        kind: Result of `survey`.
+        where: Source of the masks, for messages.
+        told: Meaning as defined by their source; None if undefined.
+    """
     if use == "lrm":
         return use, "for LRMs alone (data.mask_use=lrm)"
     found: MaskUse = (told or kind.use) if use == "auto" else use

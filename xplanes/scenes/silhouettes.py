@@ -39,7 +39,12 @@ MOST_VIEWS = 5
 
 
 def foreground(views: Views, margins: Sequence[int]) -> Tensor:
-    """Pixels within each image's margin of its silhouette, but for padding. bool [V, H, W]"""
+    """Pixels near the silhouettes. bool [V, H, W]
+
+    Args:
+        views: Images; their padding is never foreground.
+        margins: Distance in pixels for each image. [V]
+    """
     near = torch.zeros(views.images.shape[:3], dtype=torch.bool)
     for index, reach in enumerate(margins):
         shown = views.silhouette(index)
